@@ -1,0 +1,2 @@
+//! Prefix sums against the standard library.
+fn main() {}
