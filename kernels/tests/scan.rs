@@ -1,2 +1,0 @@
-//! Prefix sums against the standard library.
-fn main() {}
