@@ -7,10 +7,16 @@
 //! Conventions (those of the whole project): right-handed world; camera axes +x right, +y down, +z forward; the view
 //! matrix maps world to camera; the centre of pixel (i, j) lies at (i + 0.5, j + 0.5).
 
+mod colmap;
+mod colmap_binary;
+mod colmap_text;
+mod downscale;
 mod error;
+mod images;
 mod split;
 
-use std::path::PathBuf;
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 pub use error::{CaptureError, CaptureWarning};
@@ -23,7 +29,7 @@ pub struct Capture {
     pub name: String,
     /// The folder that was read.
     pub root: PathBuf,
-    /// All views, sorted by [`View::name`].
+    /// All views, sorted by [`View::name`]. Never empty.
     pub views: Vec<View>,
     /// Points of structure from motion, in file order. Never empty.
     pub points: Vec<Point>,
@@ -62,7 +68,7 @@ pub struct Point {
 /// How to read a capture.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct CaptureOptions {
-    /// Area-average every photo by this factor (1: as it is). Default 1.
+    /// Area-average every photo by this factor, at least 1 (1: as it is). Default 1.
     pub downscale: u32,
 }
 
@@ -71,3 +77,108 @@ impl Default for CaptureOptions {
         Self { downscale: 1 }
     }
 }
+
+impl Capture {
+    /// Reads the capture in the folder `root`.
+    ///
+    /// The COLMAP model is looked for in `sparse/0`, then `sparse`, then `root` itself, binary before text; the
+    /// photos in `images`, or beside the model's root when there is no such folder. Cameras must be `PINHOLE` or
+    /// `SIMPLE_PINHOLE`. Photos are decoded in parallel; where a photo's size is a uniform rescale of its camera's,
+    /// the intrinsics follow the photo and a warning says so. The held-out views are those `split.json` names, or
+    /// else every 8th by name from the first.
+    ///
+    /// # Errors
+    ///
+    /// Whatever makes the capture unusable, see [`CaptureError`]. A capture of a single photo is read: whether there
+    /// is anything to train on is for [`Capture::check_trainable`].
+    pub fn load(root: &Path, options: &CaptureOptions) -> Result<Self, CaptureError> {
+        if options.downscale == 0 {
+            return Err(CaptureError::ZeroDownscale);
+        }
+        let (model, mut warnings) = colmap::read(root)?;
+        let views = images::load(root, &model, options.downscale, &mut warnings)?;
+        let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
+        let split = Split::of_capture(root, &names, &mut warnings)?;
+        Ok(Self {
+            name: folder_name(root),
+            root: root.to_path_buf(),
+            split,
+            points: model.points,
+            views,
+            warnings,
+        })
+    }
+
+    /// Checks that there is at least one view to train on.
+    ///
+    /// # Errors
+    ///
+    /// [`CaptureError::NothingToTrainOn`], which is what the usual split leaves of a single photo.
+    pub fn check_trainable(&self) -> Result<(), CaptureError> {
+        if self.split.train.is_empty() {
+            return Err(CaptureError::NothingToTrainOn {
+                root: self.root.clone(),
+                photos: self.views.len(),
+            });
+        }
+        Ok(())
+    }
+
+    /// The views to train on, in the order of their names.
+    pub fn train_views(&self) -> impl ExactSizeIterator<Item = &View> {
+        self.split.train.iter().map(|&index| &self.views[index])
+    }
+
+    /// The held-out views, in the order of their names.
+    pub fn test_views(&self) -> impl ExactSizeIterator<Item = &View> {
+        self.split.test.iter().map(|&index| &self.views[index])
+    }
+
+    /// Number of photos of each size, `(width, height, count)`, the most frequent first.
+    pub fn image_sizes(&self) -> Vec<(u32, u32, usize)> {
+        let mut counts = HashMap::new();
+        for view in &self.views {
+            *counts.entry((view.width, view.height)).or_insert(0) += 1;
+        }
+        let mut sizes: Vec<_> = counts
+            .into_iter()
+            .map(|((width, height), count)| (width, height, count))
+            .collect();
+        sizes.sort_by_key(|&(width, height, count)| (std::cmp::Reverse(count), width, height));
+        sizes
+    }
+}
+
+impl View {
+    /// The camera's centre in the world, `-R^T t`.
+    pub fn center(&self) -> [f64; 3] {
+        let m = &self.viewmat;
+        std::array::from_fn(|axis| {
+            -(m[0][axis] * m[0][3] + m[1][axis] * m[1][3] + m[2][axis] * m[2][3])
+        })
+    }
+
+    /// Where a world point falls in the photo, `(x, y)` in pixels, and its depth along the camera's axis. Points at
+    /// depth 0 have no finite place.
+    pub fn project(&self, point: [f64; 3]) -> ([f64; 2], f64) {
+        let [x, y, z]: [f64; 3] = std::array::from_fn(|row| {
+            let r = &self.viewmat[row];
+            r[0] * point[0] + r[1] * point[1] + r[2] * point[2] + r[3]
+        });
+        let [fx, fy, cx, cy] = self.intrinsics;
+        ([fx * x / z + cx, fy * y / z + cy], z)
+    }
+}
+
+/// Last component of the folder's path, also for `.` and `..`.
+fn folder_name(root: &Path) -> String {
+    let name = |path: &Path| Some(path.file_name()?.to_string_lossy().into_owned());
+    name(root)
+        .or_else(|| name(&root.canonicalize().ok()?))
+        .unwrap_or_else(|| "capture".to_owned())
+}
+
+#[cfg(test)]
+mod test_capture;
+#[cfg(test)]
+mod tests;
