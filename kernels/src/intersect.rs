@@ -340,7 +340,14 @@ pub fn intersect(
     let (splats, tiles) = (frames.splats(), frames.tiles());
     let depths = Buffer::empty(client, splats);
     if let Some((count, dim)) = per_element(splats) {
-        depth_keys::launch(client, count, dim, packed.arg(), depths.arg(), splats as u32);
+        depth_keys::launch(
+            client,
+            count,
+            dim,
+            packed.arg(),
+            depths.arg(),
+            splats as u32,
+        );
     }
     let (_, order) = sort_pairs(client, &depths, &iota(client, splats), 32);
 

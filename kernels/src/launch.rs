@@ -141,11 +141,23 @@ mod tests {
 
     #[test]
     fn workgroups_fold_into_two_dimensions_and_cover_all_work() {
-        for cubes in [1, 2, 65_535, 65_536, 65_537, 131_071, 1 << 24, (1 << 31) + 3] {
+        for cubes in [
+            1,
+            2,
+            65_535,
+            65_536,
+            65_537,
+            131_071,
+            1 << 24,
+            (1 << 31) + 3,
+        ] {
             let (x, y) = dims(cubes);
             assert!(x <= 65_535 && y <= 65_535, "{cubes}: {x} x {y}");
             assert!(x * y >= cubes as u64, "{cubes}: {x} x {y} is too few");
-            assert!(x * y - (cubes as u64) < x, "{cubes}: {x} x {y} wastes a row");
+            assert!(
+                x * y - (cubes as u64) < x,
+                "{cubes}: {x} x {y} wastes a row"
+            );
         }
     }
 }

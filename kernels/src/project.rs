@@ -196,10 +196,7 @@ struct Splat {
 fn clamp_to_view(ratio: f32, focal: f32, centre: f32, size: f32, margin: f32) -> (f32, bool) {
     let low = -(centre + margin * size) / focal;
     let high = (size - centre + margin * size) / focal;
-    (
-        max(low, min(ratio, high)),
-        ratio >= low && ratio <= high,
-    )
+    (max(low, min(ratio, high)), ratio >= low && ratio <= high)
 }
 
 #[cube]
@@ -378,7 +375,19 @@ fn project_vjp(
     let g_w21 = grad_packed[at + 4];
     let g_compensation = grad_packed[at + 6];
     let Splat {
-        p, u, v, q, r, m, a, b, det, w22, v1, v2, ..
+        p,
+        u,
+        v,
+        q,
+        r,
+        m,
+        a,
+        b,
+        det,
+        w22,
+        v1,
+        v2,
+        ..
     } = splat;
 
     // w21 = -(b/a) w22,  w22 = √(a/det),  w11 = 1/√a,  compensation = |m|/√det
@@ -436,8 +445,7 @@ fn project_vjp(
     let g_p = Vec3::new(
         g_ratio_x / p.z,
         g_ratio_y / p.z,
-        g_depth
-            - (g_ratio_x * (p.x / p.z) + g_ratio_y * (p.y / p.z) + g_j1 * j1 + g_j2 * j2) / p.z,
+        g_depth - (g_ratio_x * (p.x / p.z) + g_ratio_y * (p.y / p.z) + g_j1 * j1 + g_j2 * j2) / p.z,
     );
 
     Gradient {
@@ -643,7 +651,13 @@ pub fn project_backward(
     wanted: [bool; 5],
 ) -> [Option<Buffer>; 5] {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
-    let lens = [gaussians * 3, gaussians * 4, gaussians * 3, cameras * 16, cameras * 4];
+    let lens = [
+        gaussians * 3,
+        gaussians * 4,
+        gaussians * 3,
+        cameras * 16,
+        cameras * 4,
+    ];
     // An unwanted gradient still needs something to bind.
     let grads: [Buffer; 5] =
         std::array::from_fn(|i| Buffer::empty(client, if wanted[i] { lens[i] } else { 1 }));

@@ -213,7 +213,8 @@ fn rasterize_forward(
                     done = true;
                 } else {
                     let weight = alpha * t;
-                    let color = ids[k as usize] as usize * channels as usize + first_channel as usize;
+                    let color =
+                        ids[k as usize] as usize * channels as usize + first_channel as usize;
                     #[unroll]
                     for channel in 0..width {
                         sums[channel] += weight * colors[color + channel];
@@ -404,7 +405,8 @@ fn rasterize_backward(
                 let value = grad_output[from + channel];
                 g[q * width + channel] = value;
                 if comptime!(has_background) {
-                    seen += value * background[(camera * channels + first_channel) as usize + channel];
+                    seen +=
+                        value * background[(camera * channels + first_channel) as usize + channel];
                 }
             }
             if comptime!(first_launch) {
@@ -694,7 +696,12 @@ pub fn rasterize_vjp(
 ) -> [Option<Buffer>; 4] {
     let splats = frames.splats();
     let channels = inputs.channels;
-    let [wants_packed, wants_colors, wants_opacities, wants_background] = wanted;
+    let [
+        wants_packed,
+        wants_colors,
+        wants_opacities,
+        wants_background,
+    ] = wanted;
     let shape = wants_packed || wants_opacities;
     let reserve = |needed: bool, len: usize| Buffer::empty(client, if needed { len } else { 1 });
     let grad_packed = reserve(shape, splats * PACKED);

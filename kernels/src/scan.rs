@@ -154,7 +154,10 @@ pub fn exclusive_sum_with_total(client: &Client, input: &Buffer) -> Result<(Buff
     let total = if sums.is_empty() {
         0
     } else {
-        sums.read_u32(client)?.iter().map(|&sum| u64::from(sum)).sum()
+        sums.read_u32(client)?
+            .iter()
+            .map(|&sum| u64::from(sum))
+            .sum()
     };
     Ok((output, total))
 }

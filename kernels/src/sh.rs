@@ -142,7 +142,13 @@ fn sh_forward(
 
 /// Colours [C, N, 3] for coefficients [N, `stored`, 3] and directions [C, N, 3] of any length. Coefficients beyond
 /// `(degree + 1)²` are not read; `degree` is cut to [`MAX_DEGREE`] and to what is stored.
-pub fn evaluate(client: &Client, coefficients: &Buffer, dirs: &Buffer, stored: usize, degree: usize) -> Buffer {
+pub fn evaluate(
+    client: &Client,
+    coefficients: &Buffer,
+    dirs: &Buffer,
+    stored: usize,
+    degree: usize,
+) -> Buffer {
     let (gaussians, cameras, degree) = sizes(coefficients, dirs, stored, degree);
     let colors = Buffer::empty(client, dirs.len());
     if let Some((count, dim)) = per_element(cameras * gaussians) {
@@ -162,7 +168,12 @@ pub fn evaluate(client: &Client, coefficients: &Buffer, dirs: &Buffer, stored: u
     colors
 }
 
-fn sizes(coefficients: &Buffer, dirs: &Buffer, stored: usize, degree: usize) -> (usize, usize, usize) {
+fn sizes(
+    coefficients: &Buffer,
+    dirs: &Buffer,
+    stored: usize,
+    degree: usize,
+) -> (usize, usize, usize) {
     let gaussians = coefficients.len() / (stored.max(1) * 3);
     let cameras = dirs.len() / 3 / gaussians.max(1);
     let mut degree = degree.min(MAX_DEGREE);

@@ -122,7 +122,12 @@ pub fn iota(client: &Client, len: usize) -> Buffer {
 
 /// Sorts the pairs by the lowest `key_bits` bits of their keys, ascending; pairs of equal keys keep their order.
 /// Pairs without a partner (one buffer longer than the other) are dropped.
-pub fn sort_pairs(client: &Client, keys: &Buffer, values: &Buffer, key_bits: u32) -> (Buffer, Buffer) {
+pub fn sort_pairs(
+    client: &Client,
+    keys: &Buffer,
+    values: &Buffer,
+    key_bits: u32,
+) -> (Buffer, Buffer) {
     let len = keys.len().min(values.len());
     let (mut keys, mut values) = (keys.clone(), values.clone());
     if len == 0 {

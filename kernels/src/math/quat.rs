@@ -43,16 +43,6 @@ impl Quat {
         to[at + 3] = self.z;
     }
 
-    /// self factor
-    pub fn scale(self, factor: f32) -> Quat {
-        Quat {
-            w: self.w * factor,
-            x: self.x * factor,
-            y: self.y * factor,
-            z: self.z * factor,
-        }
-    }
-
     /// Scalar product.
     pub fn dot(self, other: Quat) -> f32 {
         self.w * other.w + self.x * other.x + self.y * other.y + self.z * other.z

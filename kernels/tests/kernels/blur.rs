@@ -22,13 +22,22 @@ fn windows_agree_with_float64_also_when_wider_than_the_image() {
             let mut sum = 0.0;
             for (ky, wy) in window.iter().enumerate() {
                 for (kx, wx) in window.iter().enumerate() {
-                    sum += f64::from(*wy) * f64::from(*wx)
-                        * at(bi, y as isize + ky as isize - 3, x as isize + kx as isize - 3, di);
+                    sum += f64::from(*wy)
+                        * f64::from(*wx)
+                        * at(
+                            bi,
+                            y as isize + ky as isize - 3,
+                            x as isize + kx as isize - 3,
+                            di,
+                        );
                 }
             }
             expected.push(sum);
         }
-        let blurred = download(&client, &blur(&client, &upload(&client, &image), h, w, d, &window));
+        let blurred = download(
+            &client,
+            &blur(&client, &upload(&client, &image), h, w, d, &window),
+        );
         assert_close(&format!("{b}x{h}x{w}x{d}"), &blurred, &expected, 1e-6);
     }
 }

@@ -1,7 +1,6 @@
 //! The device the tests run on, and small helpers.
 
 use cubecl::client::Client;
-use cubecl::prelude::*;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 use splat_kernels::Buffer;
@@ -42,7 +41,11 @@ pub fn download_u32(client: &Client, buffer: &Buffer) -> Vec<u32> {
 /// |a - b| / |b| over all entries; the absolute error where b is all zero.
 pub fn relative_l2(a: &[f32], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len());
-    let error: f64 = a.iter().zip(b).map(|(a, b)| (f64::from(*a) - b).powi(2)).sum();
+    let error: f64 = a
+        .iter()
+        .zip(b)
+        .map(|(a, b)| (f64::from(*a) - b).powi(2))
+        .sum();
     let norm: f64 = b.iter().map(|b| b * b).sum();
     if norm > 0.0 {
         (error / norm).sqrt()

@@ -30,9 +30,17 @@ fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
 }
 
 /// One Gaussian to one camera: the packed row, all zero where culled.
-pub fn project(mean: &[f64], quat: &[f64], scale: &[f64], viewmat: &[f64], intrinsics: &[f64], view: &View) -> [f64; 9] {
+pub fn project(
+    mean: &[f64],
+    quat: &[f64],
+    scale: &[f64],
+    viewmat: &[f64],
+    intrinsics: &[f64],
+    view: &View,
+) -> [f64; 9] {
     let w: [[f64; 3]; 3] = std::array::from_fn(|i| std::array::from_fn(|j| viewmat[i * 4 + j]));
-    let p: [f64; 3] = std::array::from_fn(|i| dot(w[i], [mean[0], mean[1], mean[2]]) + viewmat[i * 4 + 3]);
+    let p: [f64; 3] =
+        std::array::from_fn(|i| dot(w[i], [mean[0], mean[1], mean[2]]) + viewmat[i * 4 + 3]);
     let [x, y, z] = p;
     let [fx, fy, cx, cy] = [intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]];
     let length = quat.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -45,9 +53,21 @@ pub fn project(mean: &[f64], quat: &[f64], scale: &[f64], viewmat: &[f64], intri
     let v = (y / z).clamp(-(cy + m * sy) / fy, (sy - cy + m * sy) / fy);
     let [qw, qx, qy, qz] = std::array::from_fn(|i| quat[i] / length);
     let r = [
-        [1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)],
-        [2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)],
-        [2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)],
+        [
+            1.0 - 2.0 * (qy * qy + qz * qz),
+            2.0 * (qx * qy - qw * qz),
+            2.0 * (qx * qz + qw * qy),
+        ],
+        [
+            2.0 * (qx * qy + qw * qz),
+            1.0 - 2.0 * (qx * qx + qz * qz),
+            2.0 * (qy * qz - qw * qx),
+        ],
+        [
+            2.0 * (qx * qz - qw * qy),
+            2.0 * (qy * qz + qw * qx),
+            1.0 - 2.0 * (qx * qx + qy * qy),
+        ],
     ];
     let j = [[fx / z, 0.0, -fx * u / z], [0.0, fy / z, -fy * v / z]];
     // V = J W R diag(s)
@@ -78,8 +98,15 @@ pub fn project(mean: &[f64], quat: &[f64], scale: &[f64], viewmat: &[f64], intri
         reach * a.sqrt(),
         reach * (dot(v2, v2) + e).sqrt(),
     ];
-    let on_screen = row[0] + row[7] >= 0.0 && row[0] - row[7] <= sx && row[1] + row[8] >= 0.0 && row[1] - row[8] <= sy;
-    if on_screen && row.iter().all(|v| v.is_finite()) { row } else { [0.0; 9] }
+    let on_screen = row[0] + row[7] >= 0.0
+        && row[0] - row[7] <= sx
+        && row[1] + row[8] >= 0.0
+        && row[1] - row[8] <= sy;
+    if on_screen && row.iter().all(|v| v.is_finite()) {
+        row
+    } else {
+        [0.0; 9]
+    }
 }
 
 /// o exp(-sigma) of a packed row at a pixel centre.
@@ -91,9 +118,17 @@ pub fn raw_alpha(row: &[f64], opacity: f64, x: f64, y: f64) -> f64 {
 }
 
 /// The image [H, W, D + 1] of one camera.
-pub fn rasterize(packed: &[f64], colors: &[f64], opacities: &[f64], background: &[f64], view: &View) -> Vec<f64> {
+pub fn rasterize(
+    packed: &[f64],
+    colors: &[f64],
+    opacities: &[f64],
+    background: &[f64],
+    view: &View,
+) -> Vec<f64> {
     let channels = background.len();
-    let mut order: Vec<usize> = (0..opacities.len()).filter(|n| packed[n * 9 + 7] > 0.0).collect();
+    let mut order: Vec<usize> = (0..opacities.len())
+        .filter(|n| packed[n * 9 + 7] > 0.0)
+        .collect();
     order.sort_by(|a, b| packed[a * 9 + 2].total_cmp(&packed[b * 9 + 2]));
     let mut image = Vec::with_capacity(view.width * view.height * (channels + 1));
     for py in 0..view.height {
@@ -101,7 +136,12 @@ pub fn rasterize(packed: &[f64], colors: &[f64], opacities: &[f64], background: 
             let mut t = 1.0;
             let mut sum = vec![0.0; channels];
             for &n in &order {
-                let raw = raw_alpha(&packed[n * 9..n * 9 + 9], opacities[n], px as f64 + 0.5, py as f64 + 0.5);
+                let raw = raw_alpha(
+                    &packed[n * 9..n * 9 + 9],
+                    opacities[n],
+                    px as f64 + 0.5,
+                    py as f64 + 0.5,
+                );
                 if raw < view.alpha_min {
                     continue;
                 }
@@ -145,6 +185,8 @@ pub fn spherical_harmonics(coefficients: &[f64], dir: &[f64], degree: usize) -> 
         -0.5900435899266435 * x * (xx - 3.0 * yy),
     ];
     std::array::from_fn(|channel| {
-        (0..(degree + 1) * (degree + 1)).map(|k| basis[k] * coefficients[k * 3 + channel]).sum()
+        (0..(degree + 1) * (degree + 1))
+            .map(|k| basis[k] * coefficients[k * 3 + channel])
+            .sum()
     })
 }

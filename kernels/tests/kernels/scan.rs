@@ -20,8 +20,16 @@ fn prefix_sums_of_any_length_equal_those_of_the_standard_library() {
             })
             .unzip();
         let input = Buffer::from_u32(&client, &values);
-        assert_eq!(download_u32(&client, &scan::exclusive_sum(&client, &input)), exclusive, "{len}");
-        assert_eq!(download_u32(&client, &scan::inclusive_sum(&client, &input)), inclusive, "{len}");
+        assert_eq!(
+            download_u32(&client, &scan::exclusive_sum(&client, &input)),
+            exclusive,
+            "{len}"
+        );
+        assert_eq!(
+            download_u32(&client, &scan::inclusive_sum(&client, &input)),
+            inclusive,
+            "{len}"
+        );
         let (sums, total) = scan::exclusive_sum_with_total(&client, &input).unwrap();
         assert_eq!(download_u32(&client, &sums), exclusive, "{len}");
         assert_eq!(total, u64::from(running), "{len}");

@@ -1,15 +1,19 @@
 //! Radix sort.
 
 use rand::RngExt;
-use splat_kernels::sort::{bits_for, iota, sort_pairs};
 use splat_kernels::Buffer;
+use splat_kernels::sort::{bits_for, iota, sort_pairs};
 
 use crate::device::{client, download_u32, rng};
 
 /// Sorts `keys` on the device and with the standard library's stable sort.
 fn check(name: &str, keys: &[u32], bits: u32) {
     let Some(client) = client() else { return };
-    let mask = if bits == 32 { u32::MAX } else { (1 << bits) - 1 };
+    let mask = if bits == 32 {
+        u32::MAX
+    } else {
+        (1 << bits) - 1
+    };
     let mut expected: Vec<u32> = (0..keys.len() as u32).collect();
     expected.sort_by_key(|&i| keys[i as usize] & mask);
     let (sorted, order) = sort_pairs(
@@ -20,9 +24,15 @@ fn check(name: &str, keys: &[u32], bits: u32) {
     );
     let order = download_u32(&client, &order);
     let sorted = download_u32(&client, &sorted);
-    assert!(order == expected, "{name}: order differs from the stable sort's");
     assert!(
-        sorted.iter().zip(&order).all(|(key, &i)| *key == keys[i as usize]),
+        order == expected,
+        "{name}: order differs from the stable sort's"
+    );
+    assert!(
+        sorted
+            .iter()
+            .zip(&order)
+            .all(|(key, &i)| *key == keys[i as usize]),
         "{name}: keys and values were separated"
     );
 }
@@ -44,7 +54,9 @@ fn equal_keys_stay_in_order() {
     check("all keys equal", &[7; 5000], 32);
     let keys: Vec<u32> = (0..50_000).map(|_| rng.random_range(0..5)).collect();
     check("five keys", &keys, 3);
-    let keys: Vec<u32> = (0..50_000).map(|i| if i % 2 == 0 { 0 } else { u32::MAX }).collect();
+    let keys: Vec<u32> = (0..50_000)
+        .map(|i| if i % 2 == 0 { 0 } else { u32::MAX })
+        .collect();
     check("two extreme keys", &keys, 32);
     check("nothing to sort by", &keys, 0);
 }
@@ -60,7 +72,17 @@ fn only_the_given_bits_are_sorted_by() {
 
 #[test]
 fn bits_are_counted() {
-    for (count, bits) in [(0, 0), (1, 0), (2, 1), (3, 2), (4, 2), (5, 3), (511, 9), (512, 9), (513, 10)] {
+    for (count, bits) in [
+        (0, 0),
+        (1, 0),
+        (2, 1),
+        (3, 2),
+        (4, 2),
+        (5, 3),
+        (511, 9),
+        (512, 9),
+        (513, 10),
+    ] {
         assert_eq!(bits_for(count), bits, "{count}");
     }
 }
