@@ -6,6 +6,8 @@ mod blur;
 mod project;
 mod rasterize;
 mod spherical_harmonics;
+#[cfg(all(test, feature = "cpu", feature = "wgpu"))]
+mod tests;
 
 use burn::backend::TensorMetadata;
 use burn::tensor::{DType, Shape};
