@@ -15,6 +15,7 @@ use cubecl::prelude::*;
 use crate::launch::{Buffer, per_element};
 use crate::math::is_finite;
 use crate::project::PACKED;
+use crate::rasterize::MAX_SLOT_VALUES;
 use crate::scan::exclusive_sum_with_total;
 use crate::sort::{bits_for, iota, ordered_bits, sort_pairs};
 
@@ -116,8 +117,9 @@ impl fmt::Display for IntersectError {
 
 impl std::error::Error for IntersectError {}
 
-/// Instances that can be indexed.
-pub const MAX_INSTANCES: u64 = i32::MAX as u64;
+/// Instances that can be listed: kernels address memory by 32-bit indices, and the backward pass keeps up to
+/// [`MAX_SLOT_VALUES`] floats per instance.
+pub const MAX_INSTANCES: u64 = u32::MAX as u64 / MAX_SLOT_VALUES as u64;
 
 /// The part of a splat that can be seen: the ellipse sigma <= `cut`.
 #[derive(CubeType, Clone, Copy)]

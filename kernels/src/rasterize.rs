@@ -41,6 +41,9 @@ const ROW: usize = BACKWARD_UNITS_USIZE + 1;
 /// Gradients of a splat's shape and opacity in a slot, in the order of [`SHAPE`]; those of colours follow.
 const SHAPE_GRADIENTS: usize = SHAPE;
 
+/// Most gradients of one instance in one launch.
+pub const MAX_SLOT_VALUES: usize = SHAPE_GRADIENTS + MAX_CHANNELS;
+
 /// Thresholds of the blending.
 #[derive(Clone, Copy, Debug)]
 pub struct RasterizeSettings {

@@ -8,10 +8,3 @@ use cubecl::prelude::*;
 pub(crate) fn is_finite(value: f32) -> bool {
     (u32::reinterpret(value) & 0x7f80_0000u32) != 0x7f80_0000u32
 }
-
-/// `a + b c` with one rounding wherever the device has it. Written out where two kernels must come to the same bits:
-/// it leaves the compiler nothing to contract on its own.
-#[cube]
-pub(crate) fn fma_add(a: f32, b: f32, c: f32) -> f32 {
-    fma(b, c, a)
-}

@@ -3,7 +3,9 @@
 use splat_kernels::intersect::Frames;
 use splat_kernels::rasterize::{RasterizeInputs, RasterizeSettings, rasterize, rasterize_vjp};
 
-use crate::device::{assert_close, client, differences, download, rng, uniform, upload, wide};
+use crate::device::{
+    assert_close, client, differences, download, download_u32, rng, uniform, upload, wide,
+};
 use crate::reference::{self, View};
 
 const SETTINGS: RasterizeSettings = RasterizeSettings {
@@ -353,5 +355,97 @@ fn only_the_wanted_gradients_and_the_same_bits_every_time() {
                 assert_close("wanted alone", some, &wide(all), 1e-6);
             }
         }
+    }
+}
+
+#[test]
+fn more_tiles_than_one_dimension_of_workgroups_can_hold() {
+    let Some(client) = client() else { return };
+    // One pixel wide: 65,600 tiles below each other.
+    let height = 16 * 65_600;
+    let mut scene = Scene::new(1, 3, 1, height, 1, [0.5, 0.9], 42);
+    scene.background = None;
+    for (row, y) in scene
+        .packed
+        .chunks_mut(9)
+        .zip([0.5, 16.0 * 65_535.0, f64::from(height) - 0.5])
+    {
+        row[0] = 0.5;
+        row[1] = y as f32;
+    }
+    let inputs = scene.inputs(&client);
+    let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
+    let expected = scene.reference(&scene.wide());
+    assert_close("image", &download(&client, &output), &expected, 1e-6);
+    let grad = upload(&client, &vec![1.0; output.len()]);
+    let [_, colors, ..] = rasterize_vjp(
+        &client,
+        &inputs,
+        &state,
+        &grad,
+        &scene.frames,
+        &SETTINGS,
+        [false, true, false, false],
+    );
+    // One colour of 1 shines on all pixels: the sum of its weights.
+    let expected: Vec<f64> = (0..3)
+        .map(|n| {
+            let mut alone = scene.wide();
+            alone[1] = (0..3)
+                .map(|other| f64::from(u8::from(other == n)))
+                .collect();
+            scene
+                .reference(&alone)
+                .chunks(2)
+                .map(|pixel| pixel[0])
+                .sum()
+        })
+        .collect();
+    assert_close(
+        "colours",
+        &download(&client, &colors.unwrap()),
+        &expected,
+        1e-5,
+    );
+}
+
+/// Prints times of the stages; run it by name with `--ignored --nocapture`.
+#[test]
+#[ignore = "a measurement, not a check"]
+fn time_of_the_stages_at_270_by_480() {
+    let Some(client) = client() else { return };
+    let scene = Scene::new(1, 15_000, 270, 480, 3, [0.05, 0.95], 43);
+    let inputs = scene.inputs(&client);
+    let grad = upload(&client, &vec![1.0; 270 * 480 * 4]);
+    for round in 0..4 {
+        let start = std::time::Instant::now();
+        let lists = splat_kernels::intersect::intersect(
+            &client,
+            &inputs.packed,
+            &inputs.opacities,
+            &scene.frames,
+        )
+        .unwrap();
+        download_u32(&client, &lists.ranges);
+        let intersected = start.elapsed();
+        let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
+        download(&client, &output);
+        let rendered = start.elapsed() - intersected;
+        let grads = rasterize_vjp(
+            &client,
+            &inputs,
+            &state,
+            &grad,
+            &scene.frames,
+            &SETTINGS,
+            [true; 4],
+        );
+        download(&client, grads[2].as_ref().unwrap());
+        let all = start.elapsed();
+        println!(
+            "round {round}: {} instances, intersect {intersected:?}, intersect + forward {rendered:?}, backward {:?}",
+            lists.instances,
+            all - rendered - intersected,
+        );
     }
 }

@@ -99,7 +99,8 @@ impl SplatBackend for CubeBackend {
     }
 
     /// # Panics
-    /// Where the device fails, or more than 2^31 - 1 pairs of a splat and a tile would have to be listed.
+    /// Where the device fails, or more pairs of a splat and a tile would have to be listed than can be indexed
+    /// (`splat_kernels::intersect::MAX_INSTANCES`).
     fn rasterize_forward(
         packed: CubeTensor,
         colors: CubeTensor,
