@@ -25,19 +25,19 @@ use crate::project::PACKED;
 /// Channels of one launch.
 pub const MAX_CHANNELS: usize = 16;
 
-/// Pixels of a tile.
-const PIXELS: u32 = TILE * TILE;
 /// Floats of a splat in shared memory: mean x, y, w11, w21, w22, opacity.
 const SHAPE: usize = 6;
 
-/// Units of a tile's workgroup in the backward pass; each owns [`PIXELS_PER_UNIT`] pixels.
-const BACKWARD_UNITS: u32 = 64;
-const BACKWARD_UNITS_USIZE: usize = BACKWARD_UNITS as usize;
-const PIXELS_PER_UNIT: usize = (PIXELS / BACKWARD_UNITS) as usize;
+/// Units of a tile's workgroup. Each owns [`PIXELS_PER_UNIT`] pixels below each other, [`ROWS_APART`] rows apart: what
+/// it reads of a splat serves them all.
+const UNITS: u32 = 64;
+const UNITS_USIZE: usize = UNITS as usize;
+const PIXELS_PER_UNIT: usize = (TILE * TILE / UNITS) as usize;
+const ROWS_APART: u32 = UNITS / TILE;
 /// Values that the units put into shared memory before they are summed: with the batch below 16 KiB together.
 const MAX_ROWS: usize = 54;
 /// Floats from one row of values to the next; odd, so that rows begin in different banks.
-const ROW: usize = BACKWARD_UNITS_USIZE + 1;
+const ROW: usize = UNITS_USIZE + 1;
 /// Gradients of a splat's shape and opacity in a slot, in the order of [`SHAPE`]; those of colours follow.
 const SHAPE_GRADIENTS: usize = SHAPE;
 
@@ -79,6 +79,34 @@ pub struct RasterizeInputs {
     pub channels: usize,
 }
 
+/// Mean, inverse Cholesky factor and opacity of a splat.
+#[derive(CubeType, Clone, Copy)]
+#[expand(derive(Clone, Copy))]
+struct Shape {
+    mean_x: f32,
+    mean_y: f32,
+    w11: f32,
+    w21: f32,
+    w22: f32,
+    opacity: f32,
+}
+
+#[cube]
+impl Shape {
+    /// The k-th of the batch.
+    fn load(shapes: &[f32], k: usize) -> Shape {
+        let at = k * SHAPE;
+        Shape {
+            mean_x: shapes[at],
+            mean_y: shapes[at + 1],
+            w11: shapes[at + 2],
+            w21: shapes[at + 3],
+            w22: shapes[at + 4],
+            opacity: shapes[at + 5],
+        }
+    }
+}
+
 /// A splat at a pixel.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
@@ -93,15 +121,14 @@ struct Sample {
     raw: f32,
 }
 
-/// The k-th splat of the batch at the pixel centre (x, y). Forward and backward both decide on this; fused
-/// multiply-adds are spelled out so that both are rounded alike.
+/// A splat at the pixel centre (x, y). Forward and backward both decide on this; fused multiply-adds are spelled out
+/// so that both are rounded alike.
 #[cube]
-fn sample(shapes: &[f32], k: usize, x: f32, y: f32) -> Sample {
-    let at = k * SHAPE;
-    let dx = x - shapes[at];
-    let dy = y - shapes[at + 1];
-    let z1 = shapes[at + 2] * dx;
-    let z2 = fma(shapes[at + 3], dx, shapes[at + 4] * dy);
+fn sample(shape: Shape, x: f32, y: f32) -> Sample {
+    let dx = x - shape.mean_x;
+    let dy = y - shape.mean_y;
+    let z1 = shape.w11 * dx;
+    let z2 = fma(shape.w21, dx, shape.w22 * dy);
     let falloff = f32::exp(-0.5f32 * fma(z2, z2, z1 * z1));
     Sample {
         dx,
@@ -109,7 +136,7 @@ fn sample(shapes: &[f32], k: usize, x: f32, y: f32) -> Sample {
         z1,
         z2,
         falloff,
-        raw: shapes[at + 5] * falloff,
+        raw: shape.opacity * falloff,
     }
 }
 
@@ -126,7 +153,7 @@ fn load_shape(packed: &[f32], opacities: &[f32], splat: usize, shapes: &mut [f32
     shapes[to + 5] = opacities[splat];
 }
 
-/// One unit per pixel, one workgroup per tile; `width` channels from `first_channel` on.
+/// One workgroup per tile; `width` channels from `first_channel` on.
 #[cube(launch)]
 fn rasterize_forward(
     packed: &[f32],
@@ -147,8 +174,8 @@ fn rasterize_forward(
     #[comptime] has_background: bool,
     #[comptime] first_launch: bool,
 ) {
-    let mut shapes = Shared::new_slice(CUBE_UNITS_USIZE * SHAPE);
-    let mut ids = Shared::new_slice(CUBE_UNITS_USIZE);
+    let mut shapes = Shared::new_slice(UNITS_USIZE * SHAPE);
+    let mut ids = Shared::new_slice(UNITS_USIZE);
     let mut range = Shared::new_slice(2usize);
     let finished = Shared::<[Atomic<u32>]>::new_slice(1usize);
 
@@ -157,11 +184,9 @@ fn rasterize_forward(
     let tiles_per_camera = grid.columns * grid.rows;
     let camera = tile / tiles_per_camera;
     let tile_in_image = tile % tiles_per_camera;
-    let pixel_x = tile_in_image % grid.columns * TILE + UNIT_POS % TILE;
-    let pixel_y = tile_in_image / grid.columns * TILE + UNIT_POS / TILE;
-    let inside = tile < grid.tiles && pixel_x < grid.width && pixel_y < grid.height;
-    let x = pixel_x as f32 + 0.5f32;
-    let y = pixel_y as f32 + 0.5f32;
+    let first_x = tile_in_image % grid.columns * TILE + UNIT_POS % TILE;
+    let first_y = tile_in_image / grid.columns * TILE + UNIT_POS / TILE;
+    let x = first_x as f32 + 0.5f32;
 
     if UNIT_POS == 0 {
         let mut start = 0u32;
@@ -177,15 +202,28 @@ fn rasterize_forward(
     let start = workgroup_uniform_load(&range[0]);
     let end = workgroup_uniform_load(&range[1]);
 
-    let mut sums = Array::<f32>::new(width);
+    let mut t = Array::<f32>::new(PIXELS_PER_UNIT);
+    let mut last = Array::<u32>::new(PIXELS_PER_UNIT);
+    // 1 until the pixel stops, then 0.
+    let mut open = Array::<u32>::new(PIXELS_PER_UNIT);
+    let mut sums = Array::<f32>::new(comptime!(PIXELS_PER_UNIT * width));
+    let mut color = Array::<f32>::new(width);
+    let mut open_pixels = 0u32;
     #[unroll]
-    for channel in 0..width {
-        sums[channel] = 0.0f32;
+    for q in 0..PIXELS_PER_UNIT {
+        let inside = tile < grid.tiles
+            && first_x < grid.width
+            && first_y + q as u32 * ROWS_APART < grid.height;
+        t[q] = 1.0f32;
+        last[q] = 0u32;
+        open[q] = select(inside, 1u32, 0u32);
+        open_pixels += open[q];
+        #[unroll]
+        for channel in 0..width {
+            sums[q * width + channel] = 0.0f32;
+        }
     }
-    let mut t = 1.0f32;
-    let mut last = 0u32;
-    let mut done = !inside;
-    if done {
+    if open_pixels == 0u32 {
         Atomic::fetch_add(&finished[0], 1u32);
     }
     sync_cube();
@@ -193,7 +231,7 @@ fn rasterize_forward(
     let mut batch = start;
     while batch < end {
         // Also keeps the units together: the batch before is no longer read.
-        if workgroup_uniform_load_atomic(&finished[0]) >= PIXELS {
+        if workgroup_uniform_load_atomic(&finished[0]) >= UNITS {
             break;
         }
         let at = batch + UNIT_POS;
@@ -204,51 +242,65 @@ fn rasterize_forward(
         }
         sync_cube();
 
-        let was_done = done;
-        let count = min(PIXELS, end - batch);
+        let was_open = open_pixels > 0u32;
+        let count = min(UNITS, end - batch);
         let mut k = 0u32;
-        while !done && k < count {
-            let s = sample(&shapes, k as usize, x, y);
-            if s.raw >= grid.alpha_min {
-                let alpha = min(alpha_max, s.raw);
-                let next = t * (1.0f32 - alpha);
-                if next < transmittance_min {
-                    done = true;
-                } else {
-                    let weight = alpha * t;
-                    let color =
-                        ids[k as usize] as usize * channels as usize + first_channel as usize;
-                    #[unroll]
-                    for channel in 0..width {
-                        sums[channel] += weight * colors[color + channel];
+        while open_pixels > 0u32 && k < count {
+            let shape = Shape::load(&shapes, k as usize);
+            let from = ids[k as usize] as usize * channels as usize + first_channel as usize;
+            #[unroll]
+            for channel in 0..width {
+                color[channel] = colors[from + channel];
+            }
+            #[unroll]
+            for q in 0..PIXELS_PER_UNIT {
+                let y = (first_y + q as u32 * ROWS_APART) as f32 + 0.5f32;
+                let s = sample(shape, x, y);
+                if open[q] == 1u32 && s.raw >= grid.alpha_min {
+                    let alpha = min(alpha_max, s.raw);
+                    let next = t[q] * (1.0f32 - alpha);
+                    if next < transmittance_min {
+                        open[q] = 0u32;
+                        open_pixels -= 1u32;
+                    } else {
+                        let weight = alpha * t[q];
+                        #[unroll]
+                        for channel in 0..width {
+                            sums[q * width + channel] += weight * color[channel];
+                        }
+                        t[q] = next;
+                        last[q] = batch + k + 1u32 - start;
                     }
-                    t = next;
-                    last = batch + k + 1u32 - start;
                 }
             }
             k += 1u32;
         }
-        if done && !was_done {
+        if was_open && open_pixels == 0u32 {
             Atomic::fetch_add(&finished[0], 1u32);
         }
-        batch += PIXELS;
+        batch += UNITS;
     }
 
-    if inside {
-        let pixel = ((camera * grid.height + pixel_y) * grid.width + pixel_x) as usize;
-        let out = pixel * (channels as usize + 1) + first_channel as usize;
-        #[unroll]
-        for channel in 0..width {
-            let mut sum = sums[channel];
-            if comptime!(has_background) {
-                sum += t * background[(camera * channels + first_channel) as usize + channel];
+    #[unroll]
+    for q in 0..PIXELS_PER_UNIT {
+        let pixel_y = first_y + q as u32 * ROWS_APART;
+        if tile < grid.tiles && first_x < grid.width && pixel_y < grid.height {
+            let pixel = ((camera * grid.height + pixel_y) * grid.width + first_x) as usize;
+            let out = pixel * (channels as usize + 1) + first_channel as usize;
+            #[unroll]
+            for channel in 0..width {
+                let mut sum = sums[q * width + channel];
+                if comptime!(has_background) {
+                    sum +=
+                        t[q] * background[(camera * channels + first_channel) as usize + channel];
+                }
+                output[out + channel] = sum;
             }
-            output[out + channel] = sum;
-        }
-        if comptime!(first_launch) {
-            output[out + channels as usize] = 1.0f32 - t;
-            transmittance[pixel] = t;
-            walked[pixel] = last;
+            if comptime!(first_launch) {
+                output[out + channels as usize] = 1.0f32 - t[q];
+                transmittance[pixel] = t[q];
+                walked[pixel] = last[q];
+            }
         }
     }
 }
@@ -275,7 +327,7 @@ pub fn rasterize(
         rasterize_forward::launch(
             client,
             cube_count(frames.tiles()),
-            CubeDim::new_1d(PIXELS),
+            CubeDim::new_1d(UNITS),
             inputs.packed.arg(),
             inputs.colors.arg(),
             inputs.opacities.arg(),
@@ -355,9 +407,9 @@ fn rasterize_backward(
     let group = comptime!(layout.group());
     let width = comptime!(layout.width);
 
-    let mut shapes = Shared::new_slice(BACKWARD_UNITS_USIZE * SHAPE);
-    let mut ids = Shared::new_slice(BACKWARD_UNITS_USIZE);
-    let mut batch_slots = Shared::new_slice(BACKWARD_UNITS_USIZE);
+    let mut shapes = Shared::new_slice(UNITS_USIZE * SHAPE);
+    let mut ids = Shared::new_slice(UNITS_USIZE);
+    let mut batch_slots = Shared::new_slice(UNITS_USIZE);
     let mut rows = Shared::new_slice(comptime!(group * values * ROW));
     let mut start = Shared::new_slice(1usize);
     let longest = Shared::<[Atomic<u32>]>::new_slice(1usize);
@@ -381,14 +433,14 @@ fn rasterize_backward(
     }
     sync_cube();
 
-    // The unit's pixels lie below each other, BACKWARD_UNITS / TILE rows apart.
     let mut t = Array::<f32>::new(PIXELS_PER_UNIT);
     let mut behind = Array::<f32>::new(PIXELS_PER_UNIT);
     let mut last = Array::<u32>::new(PIXELS_PER_UNIT);
     let mut g = Array::<f32>::new(comptime!(PIXELS_PER_UNIT * width));
+    let mut color = Array::<f32>::new(width);
     #[unroll]
     for q in 0..PIXELS_PER_UNIT {
-        let pixel_y = first_y + q as u32 * (BACKWARD_UNITS / TILE);
+        let pixel_y = first_y + q as u32 * ROWS_APART;
         t[q] = 1.0f32;
         behind[q] = 0.0f32;
         last[q] = 0u32;
@@ -425,7 +477,7 @@ fn rasterize_backward(
 
     // Batches from the back; place k of a batch holds entry remaining - 1 - k.
     while remaining > 0u32 {
-        let count = min(BACKWARD_UNITS, remaining);
+        let count = min(UNITS, remaining);
         sync_cube();
         if UNIT_POS < count {
             let at = (start + remaining - 1u32 - UNIT_POS) as usize;
@@ -447,15 +499,17 @@ fn rasterize_backward(
                 }
                 if k < count as usize {
                     let entry = remaining - 1u32 - k as u32;
-                    let color = ids[k] as usize * channels as usize + first_channel as usize;
-                    let w11 = shapes[k * SHAPE + 2];
-                    let w21 = shapes[k * SHAPE + 3];
-                    let w22 = shapes[k * SHAPE + 4];
+                    let shape = Shape::load(&shapes, k);
+                    let at = ids[k] as usize * channels as usize + first_channel as usize;
+                    #[unroll]
+                    for channel in 0..width {
+                        color[channel] = colors[at + channel];
+                    }
                     #[unroll]
                     for q in 0..PIXELS_PER_UNIT {
                         if entry < last[q] {
-                            let y = (first_y + q as u32 * (BACKWARD_UNITS / TILE)) as f32 + 0.5f32;
-                            let s = sample(&shapes, k, x, y);
+                            let y = (first_y + q as u32 * ROWS_APART) as f32 + 0.5f32;
+                            let s = sample(shape, x, y);
                             if s.raw >= grid.alpha_min {
                                 let alpha = min(alpha_max, s.raw);
                                 let clear = 1.0f32 - alpha;
@@ -465,7 +519,7 @@ fn rasterize_backward(
                                 #[unroll]
                                 for channel in 0..width {
                                     let value = g[q * width + channel];
-                                    dot += colors[color + channel] * value;
+                                    dot += color[channel] * value;
                                     if comptime!(layout.colors) {
                                         sums[comptime!(layout.first_color()) + channel] +=
                                             weight * value;
@@ -478,8 +532,8 @@ fn rasterize_backward(
                                         let g_z1 = g_sigma * s.z1;
                                         let g_z2 = g_sigma * s.z2;
                                         // d = pixel - mean
-                                        sums[0] -= g_z1 * w11 + g_z2 * w21;
-                                        sums[1] -= g_z2 * w22;
+                                        sums[0] -= g_z1 * shape.w11 + g_z2 * shape.w21;
+                                        sums[1] -= g_z2 * shape.w22;
                                         sums[2] += g_z1 * s.dx;
                                         sums[3] += g_z2 * s.dx;
                                         sums[4] += g_z2 * s.dy;
@@ -502,7 +556,7 @@ fn rasterize_backward(
             let k = from as usize + unit / values;
             if unit < comptime!(group * values) && k < count as usize {
                 let mut sum = 0.0f32;
-                for other in 0..BACKWARD_UNITS_USIZE {
+                for other in 0..UNITS_USIZE {
                     sum += rows[unit * ROW + other];
                 }
                 slot_gradients[batch_slots[k] as usize * values + unit % values] = sum;
@@ -726,7 +780,7 @@ pub fn rasterize_vjp(
                 rasterize_backward::launch(
                     client,
                     cube_count(frames.tiles()),
-                    CubeDim::new_1d(BACKWARD_UNITS),
+                    CubeDim::new_1d(UNITS),
                     inputs.packed.arg(),
                     inputs.colors.arg(),
                     inputs.opacities.arg(),

@@ -12,15 +12,20 @@ const ITEMS: usize = 8;
 /// Elements of one workgroup.
 pub(crate) const BLOCK: usize = CUBE_UNITS_USIZE * ITEMS;
 
-/// Exclusive prefix sum over the units of a workgroup, and the total. Every unit must call it.
+/// Exclusive prefix sum over the `units` of a workgroup, and the total. Every unit must call it; `shared` holds one
+/// value per unit.
 #[cube]
-pub(crate) fn cube_exclusive_sum(value: u32, shared: &mut [u32]) -> (u32, u32) {
+pub(crate) fn cube_exclusive_sum(
+    value: u32,
+    shared: &mut [u32],
+    #[comptime] units: usize,
+) -> (u32, u32) {
     let unit = UNIT_POS as usize;
     shared[unit] = value;
     sync_cube();
     let mut inclusive = value;
     let mut step = 1usize;
-    while step < CUBE_UNITS_USIZE {
+    while step < units {
         if unit >= step {
             inclusive += shared[unit - step];
         }
@@ -29,7 +34,7 @@ pub(crate) fn cube_exclusive_sum(value: u32, shared: &mut [u32]) -> (u32, u32) {
         sync_cube();
         step *= 2;
     }
-    let total = shared[CUBE_UNITS_USIZE - 1];
+    let total = shared[units - 1];
     sync_cube();
     (inclusive - value, total)
 }
@@ -45,7 +50,7 @@ fn block_sums(input: &[u32], sums: &mut [u32], len: u32, blocks: u32) {
             sum += input[first + item];
         }
     }
-    let (_before, total) = cube_exclusive_sum(sum, &mut shared);
+    let (_before, total) = cube_exclusive_sum(sum, &mut shared, CUBE_UNITS_USIZE);
     if UNIT_POS == 0 && CUBE_POS < blocks as usize {
         sums[CUBE_POS] = total;
     }
@@ -69,7 +74,7 @@ fn scan_blocks(
             sum += input[first + item];
         }
     }
-    let (before, _total) = cube_exclusive_sum(sum, &mut shared);
+    let (before, _total) = cube_exclusive_sum(sum, &mut shared, CUBE_UNITS_USIZE);
     let mut running = before;
     if blocks > 1 && CUBE_POS < blocks as usize {
         running += starts[CUBE_POS];

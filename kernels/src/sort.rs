@@ -6,14 +6,17 @@
 
 use cubecl::prelude::*;
 
-use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
+use crate::launch::{Buffer, cube_count, per_element};
 use crate::scan::{cube_exclusive_sum, exclusive_sum};
 
 const DIGIT_BITS: u32 = 4;
 const DIGITS: usize = 1 << DIGIT_BITS;
+/// Units of a workgroup: [`DIGITS`] counters of each fit well into the 16 KiB of shared memory that every device has.
+const UNITS: u32 = 128;
+const UNITS_USIZE: usize = UNITS as usize;
 /// Consecutive pairs of one unit.
-const ITEMS: usize = 8;
-const BLOCK: usize = CUBE_UNITS_USIZE * ITEMS;
+const ITEMS: usize = 16;
+const BLOCK: usize = UNITS_USIZE * ITEMS;
 
 /// Which of the [`DIGITS`] bins the pass at `shift` puts `key` in; `mask` leaves out bits that are not to be sorted by.
 #[cube]
@@ -31,7 +34,7 @@ fn count_digits(keys: &[u32], counts: &mut [u32], len: u32, blocks: u32, shift: 
     }
     sync_cube();
     for item in 0..ITEMS {
-        let at = CUBE_POS * BLOCK + item * CUBE_UNITS_USIZE + unit;
+        let at = CUBE_POS * BLOCK + item * UNITS_USIZE + unit;
         if at < len as usize {
             Atomic::fetch_add(&histogram[digit_of(keys[at], shift, mask)], 1u32);
         }
@@ -55,29 +58,29 @@ fn scatter(
     shift: u32,
     mask: u32,
 ) {
-    // ranks[digit * CUBE_UNITS + unit]: first the unit's count of the digit, then the rank of its next such pair.
-    let mut ranks = Shared::new_slice(DIGITS * CUBE_UNITS_USIZE);
-    let mut shared = Shared::new_slice(CUBE_UNITS_USIZE);
+    // ranks[digit * UNITS + unit]: first the unit's count of the digit, then the rank of its next such pair.
+    let mut ranks = Shared::new_slice(DIGITS * UNITS_USIZE);
+    let mut shared = Shared::new_slice(UNITS_USIZE);
     let mut digit_ranks = Shared::new_slice(DIGITS);
     let unit = UNIT_POS as usize;
     let first = CUBE_POS * BLOCK + unit * ITEMS;
 
     for digit in 0..DIGITS {
-        ranks[digit * CUBE_UNITS_USIZE + unit] = 0u32;
+        ranks[digit * UNITS_USIZE + unit] = 0u32;
     }
     for item in 0..ITEMS {
         if first + item < len as usize {
-            ranks[digit_of(keys[first + item], shift, mask) * CUBE_UNITS_USIZE + unit] += 1u32;
+            ranks[digit_of(keys[first + item], shift, mask) * UNITS_USIZE + unit] += 1u32;
         }
     }
     sync_cube();
 
-    // Scan of all DIGITS x CUBE_UNITS counters: every unit takes DIGITS consecutive ones.
+    // Scan of all DIGITS x UNITS counters: every unit takes DIGITS consecutive ones.
     let mut sum = 0u32;
     for k in 0..DIGITS {
         sum += ranks[unit * DIGITS + k];
     }
-    let (before, _total) = cube_exclusive_sum(sum, &mut shared);
+    let (before, _total) = cube_exclusive_sum(sum, &mut shared, UNITS_USIZE);
     let mut running = before;
     for k in 0..DIGITS {
         let count = ranks[unit * DIGITS + k];
@@ -86,7 +89,7 @@ fn scatter(
     }
     sync_cube();
     if unit < DIGITS {
-        digit_ranks[unit] = ranks[unit * CUBE_UNITS_USIZE];
+        digit_ranks[unit] = ranks[unit * UNITS_USIZE];
     }
     sync_cube();
 
@@ -94,8 +97,8 @@ fn scatter(
         if first + item < len as usize {
             let key = keys[first + item];
             let digit = digit_of(key, shift, mask);
-            let rank = ranks[digit * CUBE_UNITS_USIZE + unit];
-            ranks[digit * CUBE_UNITS_USIZE + unit] = rank + 1u32;
+            let rank = ranks[digit * UNITS_USIZE + unit];
+            ranks[digit * UNITS_USIZE + unit] = rank + 1u32;
             let to = starts[digit * blocks as usize + CUBE_POS] + rank - digit_ranks[digit];
             keys_out[to as usize] = key;
             values_out[to as usize] = values[first + item];
@@ -134,7 +137,7 @@ pub fn sort_pairs(
         return (Buffer::empty(client, 0), Buffer::empty(client, 0));
     }
     let blocks = len.div_ceil(BLOCK);
-    let dim = CubeDim::new_1d(CUBE_UNITS);
+    let dim = CubeDim::new_1d(UNITS);
     let mut shift = 0;
     let key_bits = key_bits.min(32);
     while shift < key_bits {
