@@ -7,6 +7,9 @@
 //! row-major) and launch kernels without waiting, except where they say so. Sums never use float atomics: the same
 //! input gives the same bits on one device.
 
+// `if comptime!(...)` decides while a kernel is built; joined to a condition on the device it would decide there.
+#![allow(clippy::collapsible_if)]
+
 pub mod blur;
 pub mod intersect;
 mod launch;

@@ -44,8 +44,8 @@ fn random_rows(splats: usize, seed: u64) -> (Vec<f32>, Vec<f32>) {
         };
         let x = rng.random_range(-30.0f32..150.0);
         let y = rng.random_range(-30.0f32..110.0);
-        // Few depths: many ties.
-        let depth = [0.5f32, 1.0, 1e4, 1e4 + 0.001][rng.random_range(0..4)];
+        // Few depths: many ties; negative ones, both zeros, and two that are neighbours in f32.
+        let depth = [-3.5f32, -0.0, 0.0, 1.0, 1e4, 1e4 + 0.001][rng.random_range(0..6)];
         packed.extend(row(
             x,
             y,
