@@ -1,3 +1,4 @@
 //! Captures, the training loop, evaluation, reports, and the `splat` program.
 
 pub mod capture;
+pub mod report;
