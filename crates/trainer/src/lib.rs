@@ -1,6 +1,7 @@
 //! Captures, the training loop, evaluation, reports, and the `splat` program.
 
 pub mod capture;
+pub mod cli;
 mod evaluate;
 pub mod report;
 pub mod train;

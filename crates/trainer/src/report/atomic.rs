@@ -1,6 +1,6 @@
 //! Files that are written whole or not at all.
 
-use std::io::{BufWriter, Write};
+use std::io::Write;
 use std::path::Path;
 
 use super::ReportError;
@@ -9,36 +9,25 @@ use super::ReportError;
 ///
 /// # Errors
 ///
-/// [`ReportError::Io`]; the old file, if there was one, is then untouched.
-pub fn write(path: &Path, contents: &[u8]) -> Result<(), ReportError> {
-    write_with(path, |out| out.write_all(contents))
+/// Whatever the system says; the old file, if there was one, is then untouched.
+pub fn write_atomically(path: &Path, contents: &[u8]) -> std::io::Result<()> {
+    let folder = match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    };
+    std::fs::create_dir_all(folder)?;
+    // On the same file system as its place, so that the rename is one step.
+    let mut builder = tempfile::Builder::new();
+    readable_by_all(&mut builder);
+    let mut file = builder.tempfile_in(folder)?;
+    file.write_all(contents)?;
+    file.persist(path)?;
+    Ok(())
 }
 
-/// Replaces the file `path` by what `write` puts into it, see [`write()`].
-///
-/// # Errors
-///
-/// [`ReportError::Io`], also for an error of `write` itself.
-pub fn write_with(
-    path: &Path,
-    write: impl FnOnce(&mut dyn Write) -> std::io::Result<()>,
-) -> Result<(), ReportError> {
-    let replace = || -> std::io::Result<()> {
-        let folder = match path.parent() {
-            Some(folder) if !folder.as_os_str().is_empty() => folder,
-            _ => Path::new("."),
-        };
-        std::fs::create_dir_all(folder)?;
-        // On the same file system as its place, so that the rename is one step.
-        let mut builder = tempfile::Builder::new();
-        readable_by_all(&mut builder);
-        let mut out = BufWriter::new(builder.tempfile_in(folder)?);
-        write(&mut out)?;
-        let file = out.into_inner().map_err(|error| error.into_error())?;
-        file.persist(path)?;
-        Ok(())
-    };
-    replace().map_err(|source| ReportError::Io {
+/// [`write_atomically`], its error naming the file.
+pub(super) fn write(path: &Path, contents: &[u8]) -> Result<(), ReportError> {
+    write_atomically(path, contents).map_err(|source| ReportError::Io {
         path: path.to_path_buf(),
         source,
     })
@@ -60,22 +49,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_failed_write_leaves_the_old_file_and_nothing_else() {
+    fn a_failed_write_leaves_nothing_behind() {
         let folder = tempfile::TempDir::new().unwrap();
         let path = folder.path().join("new/report.txt");
         write(&path, b"old").unwrap();
-        let failed = write_with(&path, |out| {
-            out.write_all(b"half")?;
-            Err(std::io::Error::other("power cut"))
-        });
-        let message = failed.unwrap_err().to_string();
-        assert!(message.contains("report.txt") && message.contains("power cut"));
-        assert_eq!(std::fs::read(&path).unwrap(), b"old");
         write(&path, b"new").unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"new");
-        assert_eq!(
-            std::fs::read_dir(path.parent().unwrap()).unwrap().count(),
-            1
-        );
+
+        // A folder in the file's place cannot be replaced.
+        let blocked = folder.path().join("new");
+        let message = write(&blocked, b"half").unwrap_err().to_string();
+        assert!(message.contains("new"), "{message}");
+        // Neither beside the good file nor beside the blocked one is anything else.
+        assert_eq!(std::fs::read_dir(&blocked).unwrap().count(), 1);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }
 }

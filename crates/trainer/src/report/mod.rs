@@ -1,9 +1,9 @@
 //! What a run leaves behind and shows: pictures, curves, figures, progress.
 //!
-//! Everything that is written goes through [`atomic`]: beside its place first, then renamed, so that an interrupted
-//! run leaves either the old file or the new one.
+//! Everything is written by [`write_atomically`]: beside its place first, then renamed, so that an interrupted run
+//! leaves either the old file or the new one.
 
-pub mod atomic;
+mod atomic;
 pub mod curves;
 pub mod memory;
 pub mod metrics;
@@ -11,6 +11,8 @@ pub mod png;
 pub mod progress;
 
 use std::path::PathBuf;
+
+pub use atomic::write_atomically;
 
 /// Why a report could not be written. Every message is one line that names the file.
 #[derive(Debug, thiserror::Error)]

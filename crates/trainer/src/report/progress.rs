@@ -81,7 +81,7 @@ impl Progress {
     }
 
     /// Ends the bar, which stays visible.
-    pub fn finish(self) {
+    pub fn finish(&self) {
         if let Output::Bar(bar) = &self.output {
             bar.abandon();
         }
