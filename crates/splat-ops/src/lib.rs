@@ -1,0 +1,42 @@
+//! Gaussian splatting as differentiable Burn ops: tensors in, tensors out.
+//!
+//! ```text
+//! means, quats, scales ──> project ──> Projected ─┐
+//! SH coefficients, directions ──> spherical_harmonics ──> colours ─┴─> rasterize ──> Rendered
+//! ```
+//!
+//! The ops are separate so that anything can be put between them: another colour model, another
+//! opacity, another projection. Each has a hand-written gradient, registered with Burn's autodiff,
+//! and two implementations behind one trait ([`backend::SplatBackend`]): CubeCL kernels for every
+//! CubeCL device (feature `wgpu`, `vulkan`, `cuda`) and native Rust for Burn's Flex backend
+//! (feature `cpu`; f32, and f64 as the reference).
+//!
+//! # Conventions
+//! - World and camera are right-handed; camera axes are +x right, +y down, +z forward (OpenCV,
+//!   COLMAP). `viewmat` is world-to-camera, row-major 4x4.
+//! - The centre of pixel (i, j) is at (i + 0.5, j + 0.5); intrinsics (fx, fy, cx, cy) are in pixels.
+//! - Quaternions are (w, x, y, z) of any non-zero length; scales are linear and positive; opacities
+//!   lie in (0, 1).
+//! - C is the number of cameras, N of Gaussians, D of colour channels.
+
+pub mod backend;
+pub mod settings;
+
+mod autodiff;
+mod blur;
+mod check;
+#[cfg(feature = "cpu")]
+pub mod cpu;
+#[cfg(feature = "cube")]
+mod cube;
+mod error;
+mod project;
+mod rasterize;
+mod spherical_harmonics;
+
+pub use blur::gaussian_blur;
+pub use error::OpError;
+pub use project::{Projected, project};
+pub use rasterize::{Rendered, rasterize};
+pub use settings::{ImageSize, ProjectSettings, RasterizeSettings};
+pub use spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count, spherical_harmonics};

@@ -1,0 +1,69 @@
+//! The ops on Burn's autodiff backend: one file per op says what is saved and how the gradient
+//! flows. A tracked op has N parents and one output; only gradients of tracked parents are asked
+//! of the backend.
+
+mod blur;
+mod project;
+mod rasterize;
+mod spherical_harmonics;
+
+use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
+use burn::backend::autodiff::grads::Gradients;
+use burn::backend::autodiff::graph::NodeRef;
+use burn::backend::{Autodiff, tensor::FloatTensor};
+
+use crate::backend::{SplatBackend, SplatOps};
+use crate::settings::{ProjectArgs, RasterizeArgs};
+
+impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
+    fn project(
+        means: FloatTensor<Self>,
+        quats: FloatTensor<Self>,
+        scales: FloatTensor<Self>,
+        viewmats: FloatTensor<Self>,
+        intrinsics: FloatTensor<Self>,
+        args: ProjectArgs,
+    ) -> FloatTensor<Self> {
+        project::project::<B, C>([means, quats, scales, viewmats, intrinsics], args)
+    }
+
+    fn spherical_harmonics(
+        coeffs: FloatTensor<Self>,
+        dirs: FloatTensor<Self>,
+        degree: usize,
+    ) -> FloatTensor<Self> {
+        spherical_harmonics::spherical_harmonics::<B, C>([coeffs, dirs], degree)
+    }
+
+    fn rasterize(
+        packed: FloatTensor<Self>,
+        colors: FloatTensor<Self>,
+        opacities: FloatTensor<Self>,
+        background: Option<FloatTensor<Self>>,
+        args: RasterizeArgs,
+    ) -> FloatTensor<Self> {
+        rasterize::rasterize::<B, C>([packed, colors, opacities], background, args)
+    }
+
+    fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self> {
+        blur::gaussian_blur::<B, C>(image, window)
+    }
+}
+
+/// Which parents are tracked, in order.
+fn wanted<const N: usize>(parents: &[Option<NodeRef>; N]) -> [bool; N] {
+    parents.each_ref().map(Option::is_some)
+}
+
+/// Hands each parent its gradient.
+fn register<B: SplatBackend, const N: usize>(
+    grads: &mut Gradients,
+    parents: [Option<NodeRef>; N],
+    values: [Option<FloatTensor<B>>; N],
+) {
+    for (parent, value) in parents.into_iter().zip(values) {
+        if let (Some(parent), Some(value)) = (parent, value) {
+            grads.register::<B>(parent.id, value);
+        }
+    }
+}

@@ -1,0 +1,166 @@
+//! What a backend must provide ([`SplatBackend`]), and the route from Burn's device-dispatched
+//! tensors to it (`SplatOps`).
+
+use core::fmt::Debug;
+
+use burn::backend::{Backend, backend_extension, tensor::FloatTensor};
+// The expansion of `#[backend_extension]` names these.
+#[allow(unused_imports)]
+use burn::backend::{Autodiff, Dispatch};
+
+use crate::settings::{ProjectArgs, RasterizeArgs};
+
+/// Floats per splat in the packed output of `project`:
+/// `[mean_x, mean_y, depth, w11, w21, w22, compensation, extent_x, extent_y]`.
+pub const PROJECTED_WIDTH: usize = 9;
+
+/// The forward and backward computations of one backend. Callers have checked all shapes; tensors
+/// need not be contiguous. `wanted` says which gradients are needed, in the order of the inputs;
+/// the others are `None` and cost nothing.
+pub trait SplatBackend: Backend {
+    /// What `rasterize_forward` keeps for its backward: lists of splats per tile, final
+    /// transmittances and the like.
+    type RasterizeState: Clone + Debug + Send + 'static;
+
+    /// Means `[N, 3]`, quats `[N, 4]`, scales `[N, 3]`, viewmats `[C, 4, 4]`, intrinsics `[C, 4]`
+    /// to packed splats `[C, N, 9]`.
+    fn project_forward(
+        means: FloatTensor<Self>,
+        quats: FloatTensor<Self>,
+        scales: FloatTensor<Self>,
+        viewmats: FloatTensor<Self>,
+        intrinsics: FloatTensor<Self>,
+        args: &ProjectArgs,
+    ) -> FloatTensor<Self>;
+
+    /// Gradients of the five inputs of [`project_forward`](Self::project_forward), given the
+    /// gradient `[C, N, 9]` of its output.
+    fn project_backward(
+        means: FloatTensor<Self>,
+        quats: FloatTensor<Self>,
+        scales: FloatTensor<Self>,
+        viewmats: FloatTensor<Self>,
+        intrinsics: FloatTensor<Self>,
+        grad_packed: FloatTensor<Self>,
+        args: &ProjectArgs,
+        wanted: [bool; 5],
+    ) -> [Option<FloatTensor<Self>>; 5];
+
+    /// Coefficients `[N, K, 3]`, K >= (degree + 1)^2, and directions `[C, N, 3]` to `[C, N, 3]`.
+    fn spherical_harmonics_forward(
+        coeffs: FloatTensor<Self>,
+        dirs: FloatTensor<Self>,
+        degree: usize,
+    ) -> FloatTensor<Self>;
+
+    /// Gradients of coefficients and directions, given the gradient `[C, N, 3]` of the output.
+    fn spherical_harmonics_backward(
+        coeffs: FloatTensor<Self>,
+        dirs: FloatTensor<Self>,
+        grad: FloatTensor<Self>,
+        degree: usize,
+        wanted: [bool; 2],
+    ) -> [Option<FloatTensor<Self>>; 2];
+
+    /// Packed splats `[C, N, 9]`, colours `[C, N, D]`, opacities `[C, N]` and background `[C, D]`
+    /// to `[C, H, W, D + 1]`, the last channel being alpha.
+    fn rasterize_forward(
+        packed: FloatTensor<Self>,
+        colors: FloatTensor<Self>,
+        opacities: FloatTensor<Self>,
+        background: Option<FloatTensor<Self>>,
+        args: &RasterizeArgs,
+    ) -> (FloatTensor<Self>, Self::RasterizeState);
+
+    /// Gradients of packed splats, colours, opacities and background, given the forward's output
+    /// and state and the gradient `[C, H, W, D + 1]` of that output.
+    fn rasterize_backward(
+        packed: FloatTensor<Self>,
+        colors: FloatTensor<Self>,
+        opacities: FloatTensor<Self>,
+        background: Option<FloatTensor<Self>>,
+        output: FloatTensor<Self>,
+        state: Self::RasterizeState,
+        grad_output: FloatTensor<Self>,
+        args: &RasterizeArgs,
+        wanted: [bool; 4],
+    ) -> [Option<FloatTensor<Self>>; 4];
+
+    /// Convolves rows and columns of `[B, H, W, D]` with a symmetric window of odd length, zeros
+    /// outside. Linear and self-adjoint: its own vector-Jacobian product.
+    fn gaussian_blur(image: FloatTensor<Self>, window: &[f64]) -> FloatTensor<Self>;
+}
+
+/// The forward ops as Burn dispatches them: to Flex, to CubeCL, or through autodiff to either.
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub(crate) trait SplatOps: Backend {
+    fn project(
+        means: FloatTensor<Self>,
+        quats: FloatTensor<Self>,
+        scales: FloatTensor<Self>,
+        viewmats: FloatTensor<Self>,
+        intrinsics: FloatTensor<Self>,
+        args: ProjectArgs,
+    ) -> FloatTensor<Self>;
+
+    fn spherical_harmonics(
+        coeffs: FloatTensor<Self>,
+        dirs: FloatTensor<Self>,
+        degree: usize,
+    ) -> FloatTensor<Self>;
+
+    fn rasterize(
+        packed: FloatTensor<Self>,
+        colors: FloatTensor<Self>,
+        opacities: FloatTensor<Self>,
+        background: Option<FloatTensor<Self>>,
+        args: RasterizeArgs,
+    ) -> FloatTensor<Self>;
+
+    fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self>;
+}
+
+/// Without autodiff an op is its forward, and nothing is kept.
+macro_rules! forward_only {
+    ($backend:ty) => {
+        impl SplatOps for $backend {
+            fn project(
+                means: FloatTensor<Self>,
+                quats: FloatTensor<Self>,
+                scales: FloatTensor<Self>,
+                viewmats: FloatTensor<Self>,
+                intrinsics: FloatTensor<Self>,
+                args: ProjectArgs,
+            ) -> FloatTensor<Self> {
+                Self::project_forward(means, quats, scales, viewmats, intrinsics, &args)
+            }
+
+            fn spherical_harmonics(
+                coeffs: FloatTensor<Self>,
+                dirs: FloatTensor<Self>,
+                degree: usize,
+            ) -> FloatTensor<Self> {
+                Self::spherical_harmonics_forward(coeffs, dirs, degree)
+            }
+
+            fn rasterize(
+                packed: FloatTensor<Self>,
+                colors: FloatTensor<Self>,
+                opacities: FloatTensor<Self>,
+                background: Option<FloatTensor<Self>>,
+                args: RasterizeArgs,
+            ) -> FloatTensor<Self> {
+                Self::rasterize_forward(packed, colors, opacities, background, &args).0
+            }
+
+            fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self> {
+                <Self as SplatBackend>::gaussian_blur(image, &window)
+            }
+        }
+    };
+}
+
+#[cfg(feature = "cpu")]
+forward_only!(burn::backend::Flex);
+#[cfg(feature = "cube")]
+forward_only!(burn_cubecl::CubeBackend);

@@ -1,0 +1,25 @@
+//! Separable Gaussian window over images, the building block of SSIM (Wang et al. 2004).
+
+use burn::backend::Dispatch;
+use burn::tensor::Tensor;
+
+use crate::OpError;
+use crate::backend::SplatOps;
+use crate::check::Checker;
+
+/// Convolves the rows and columns of images `[B, H, W, D]` with one symmetric window, taking zero
+/// outside of the image. Differentiable in the image; being self-adjoint, it is its own gradient.
+///
+/// # Errors
+/// When the window's length is even or it is not symmetric.
+pub fn gaussian_blur(image: Tensor<4>, window: &[f64]) -> Result<Tensor<4>, OpError> {
+    let check = Checker::new("gaussian_blur", "image", &image)?;
+    let symmetric = window.iter().eq(window.iter().rev());
+    if window.len().is_multiple_of(2) || !symmetric {
+        return Err(check.argument(format!(
+            "the window must be symmetric and of odd length, got {window:?}"
+        )));
+    }
+    let blurred = <Dispatch as SplatOps>::gaussian_blur(image.into_dispatch(), window.to_vec());
+    Ok(Tensor::from_dispatch(blurred))
+}

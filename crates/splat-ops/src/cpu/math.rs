@@ -1,0 +1,121 @@
+//! Small vectors and matrices, in rows.
+
+use super::real::Real;
+
+pub(super) type Vec3<T> = [T; 3];
+/// Rows.
+pub(super) type Mat3<T> = [[T; 3]; 3];
+/// Two rows.
+pub(super) type Mat23<T> = [[T; 3]; 2];
+
+#[inline(always)]
+pub(super) fn dot<T: Real>(a: Vec3<T>, b: Vec3<T>) -> T {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[inline(always)]
+pub(super) fn cross<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
+    [
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    ]
+}
+
+#[inline(always)]
+pub(super) fn add<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
+    [a[0] + b[0], a[1] + b[1], a[2] + b[2]]
+}
+
+#[inline(always)]
+pub(super) fn scale<T: Real>(a: Vec3<T>, s: T) -> Vec3<T> {
+    [a[0] * s, a[1] * s, a[2] * s]
+}
+
+/// Componentwise product.
+#[inline(always)]
+pub(super) fn hadamard<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {
+    [a[0] * b[0], a[1] * b[1], a[2] * b[2]]
+}
+
+/// `M v`.
+#[inline(always)]
+pub(super) fn apply<T: Real>(m: &Mat3<T>, v: Vec3<T>) -> Vec3<T> {
+    [dot(m[0], v), dot(m[1], v), dot(m[2], v)]
+}
+
+/// `v^T M`, that is `M^T v`.
+#[inline(always)]
+pub(super) fn apply_transposed<T: Real>(m: &Mat3<T>, v: Vec3<T>) -> Vec3<T> {
+    add(
+        add(scale(m[0], v[0]), scale(m[1], v[1])),
+        scale(m[2], v[2]),
+    )
+}
+
+/// `a b^T`.
+#[inline(always)]
+pub(super) fn outer<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Mat3<T> {
+    [scale(b, a[0]), scale(b, a[1]), scale(b, a[2])]
+}
+
+#[inline(always)]
+pub(super) fn add3<T: Real>(a: &Mat3<T>, b: &Mat3<T>) -> Mat3<T> {
+    [add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2])]
+}
+
+/// Unit quaternion (w, x, y, z) and the length it had; `None` when it has none or is not finite.
+/// Scaled by the largest entry first, so that neither tiny nor huge ones under- or overflow.
+#[inline(always)]
+pub(super) fn normalize_quat<T: Real>(q: [T; 4]) -> Option<([T; 4], T)> {
+    let largest = q.iter().fold(T::ZERO, |m, x| m.greatest(x.abs()));
+    if !(largest > T::ZERO && q.iter().all(|x| x.is_finite())) {
+        return None;
+    }
+    let scaled = q.map(|x| x / largest);
+    let length = scaled.iter().map(|x| *x * *x).sum::<T>().sqrt();
+    Some((scaled.map(|x| x / length), length * largest))
+}
+
+/// Rotation matrix of a unit quaternion (w, x, y, z).
+#[inline(always)]
+pub(super) fn rotation<T: Real>([w, x, y, z]: [T; 4]) -> Mat3<T> {
+    let (one, two) = (T::ONE, T::ONE + T::ONE);
+    [
+        [
+            one - two * (y * y + z * z),
+            two * (x * y - w * z),
+            two * (x * z + w * y),
+        ],
+        [
+            two * (x * y + w * z),
+            one - two * (x * x + z * z),
+            two * (y * z - w * x),
+        ],
+        [
+            two * (x * z - w * y),
+            two * (y * z + w * x),
+            one - two * (x * x + y * y),
+        ],
+    ]
+}
+
+/// Gradient of the quaternion as it was before normalisation, given the gradient `g` of its
+/// rotation matrix. Orthogonal to the quaternion.
+#[inline(always)]
+pub(super) fn rotation_backward<T: Real>(unit: [T; 4], length: T, g: &Mat3<T>) -> [T; 4] {
+    let [w, x, y, z] = unit;
+    let two = T::ONE + T::ONE;
+    let d = [
+        x * (g[2][1] - g[1][2]) + y * (g[0][2] - g[2][0]) + z * (g[1][0] - g[0][1]),
+        w * (g[2][1] - g[1][2]) + y * (g[0][1] + g[1][0]) + z * (g[0][2] + g[2][0])
+            - two * x * (g[1][1] + g[2][2]),
+        w * (g[0][2] - g[2][0]) + x * (g[0][1] + g[1][0]) + z * (g[1][2] + g[2][1])
+            - two * y * (g[0][0] + g[2][2]),
+        w * (g[1][0] - g[0][1]) + x * (g[0][2] + g[2][0]) + y * (g[1][2] + g[2][1])
+            - two * z * (g[0][0] + g[1][1]),
+    ]
+    .map(|v| two * v);
+    let radial: T = d.iter().zip(unit).map(|(d, u)| *d * u).sum();
+    core::array::from_fn(|i| (d[i] - unit[i] * radial) / length)
+}

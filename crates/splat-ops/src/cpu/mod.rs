@@ -1,0 +1,139 @@
+//! Native Rust for Burn's Flex backend: f32, and f64 as the reference.
+//!
+//! Parallel over Gaussians or rows of tiles with rayon, and deterministic: whatever is summed across
+//! threads is summed in a fixed order, so the same input gives the same bits on any number of threads.
+
+mod blur;
+mod buffer;
+mod intersect;
+mod math;
+mod project;
+mod rasterize;
+mod real;
+mod spherical_harmonics;
+
+use burn::backend::Flex;
+use burn::backend::flex::FlexTensor;
+use burn::tensor::DType;
+
+use crate::backend::SplatBackend;
+use crate::settings::{ProjectArgs, RasterizeArgs};
+
+/// Runs a generic function in the precision of a tensor. The public ops let only F32 and F64 pass.
+macro_rules! in_precision {
+    ($tensor:expr, $function:path, $($argument:expr),* $(,)?) => {
+        match $tensor.dtype() {
+            DType::F64 => $function(core::marker::PhantomData::<f64>, $($argument),*),
+            _ => $function(core::marker::PhantomData::<f32>, $($argument),*),
+        }
+    };
+}
+
+impl SplatBackend for Flex {
+    type RasterizeState = rasterize::State;
+
+    fn project_forward(
+        means: FlexTensor,
+        quats: FlexTensor,
+        scales: FlexTensor,
+        viewmats: FlexTensor,
+        intrinsics: FlexTensor,
+        args: &ProjectArgs,
+    ) -> FlexTensor {
+        in_precision!(
+            means,
+            project::forward,
+            [means, quats, scales, viewmats, intrinsics],
+            args
+        )
+    }
+
+    fn project_backward(
+        means: FlexTensor,
+        quats: FlexTensor,
+        scales: FlexTensor,
+        viewmats: FlexTensor,
+        intrinsics: FlexTensor,
+        grad_packed: FlexTensor,
+        args: &ProjectArgs,
+        wanted: [bool; 5],
+    ) -> [Option<FlexTensor>; 5] {
+        in_precision!(
+            means,
+            project::backward,
+            [means, quats, scales, viewmats, intrinsics],
+            grad_packed,
+            args,
+            wanted
+        )
+    }
+
+    fn spherical_harmonics_forward(
+        coeffs: FlexTensor,
+        dirs: FlexTensor,
+        degree: usize,
+    ) -> FlexTensor {
+        in_precision!(coeffs, spherical_harmonics::forward, coeffs, dirs, degree)
+    }
+
+    fn spherical_harmonics_backward(
+        coeffs: FlexTensor,
+        dirs: FlexTensor,
+        grad: FlexTensor,
+        degree: usize,
+        wanted: [bool; 2],
+    ) -> [Option<FlexTensor>; 2] {
+        in_precision!(
+            coeffs,
+            spherical_harmonics::backward,
+            coeffs,
+            dirs,
+            grad,
+            degree,
+            wanted
+        )
+    }
+
+    fn rasterize_forward(
+        packed: FlexTensor,
+        colors: FlexTensor,
+        opacities: FlexTensor,
+        background: Option<FlexTensor>,
+        args: &RasterizeArgs,
+    ) -> (FlexTensor, Self::RasterizeState) {
+        in_precision!(
+            packed,
+            rasterize::forward,
+            [packed, colors, opacities],
+            background,
+            args
+        )
+    }
+
+    fn rasterize_backward(
+        packed: FlexTensor,
+        colors: FlexTensor,
+        opacities: FlexTensor,
+        background: Option<FlexTensor>,
+        _output: FlexTensor,
+        state: Self::RasterizeState,
+        grad_output: FlexTensor,
+        args: &RasterizeArgs,
+        wanted: [bool; 4],
+    ) -> [Option<FlexTensor>; 4] {
+        in_precision!(
+            packed,
+            rasterize::backward,
+            [packed, colors, opacities],
+            background,
+            state,
+            grad_output,
+            args,
+            wanted
+        )
+    }
+
+    fn gaussian_blur(image: FlexTensor, window: &[f64]) -> FlexTensor {
+        in_precision!(image, blur::blur, image, window)
+    }
+}

@@ -1,0 +1,215 @@
+//! Real spherical harmonics in the basis of 3DGS, and their gradient.
+//!
+//! Every basis function of degree l is written as a homogeneous polynomial of degree l in the unit
+//! direction, so that the zero vector has a well-defined value (zero beyond degree 0).
+
+use core::marker::PhantomData;
+
+use burn::backend::flex::FlexTensor;
+use rayon::prelude::*;
+
+use super::buffer::{Buffer, tensor};
+use super::math::{Vec3, dot, scale};
+use super::real::Real;
+use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
+
+const COUNT_MAX: usize = sh_coefficient_count(SH_DEGREE_MAX);
+/// Gaussians per unit of parallel work.
+const CHUNK: usize = 512;
+
+const C0: f64 = 0.282_094_791_773_878_14;
+const C1: f64 = 0.488_602_511_902_919_9;
+const C2: [f64; 3] = [
+    1.092_548_430_592_079_2,
+    0.315_391_565_252_520_05,
+    0.546_274_215_296_039_6,
+];
+const C3: [f64; 5] = [
+    0.590_043_589_926_643_5,
+    2.890_611_442_640_554,
+    0.457_045_799_464_465_8,
+    0.373_176_332_590_115_4,
+    1.445_305_721_320_277,
+];
+
+/// Values of the first `(degree + 1)^2` basis functions in a unit direction; the rest is zero.
+#[inline(always)]
+fn basis<T: Real>(degree: usize, [x, y, z]: Vec3<T>) -> [T; COUNT_MAX] {
+    let k = T::of;
+    let mut b = [T::ZERO; COUNT_MAX];
+    b[0] = k(C0);
+    if degree >= 1 {
+        b[1] = -k(C1) * y;
+        b[2] = k(C1) * z;
+        b[3] = -k(C1) * x;
+    }
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    if degree >= 2 {
+        b[4] = k(C2[0]) * x * y;
+        b[5] = -k(C2[0]) * y * z;
+        b[6] = k(C2[1]) * (k(2.0) * zz - xx - yy);
+        b[7] = -k(C2[0]) * x * z;
+        b[8] = k(C2[2]) * (xx - yy);
+    }
+    if degree >= 3 {
+        b[9] = -k(C3[0]) * y * (k(3.0) * xx - yy);
+        b[10] = k(C3[1]) * x * y * z;
+        b[11] = -k(C3[2]) * y * (k(4.0) * zz - xx - yy);
+        b[12] = k(C3[3]) * z * (k(2.0) * zz - k(3.0) * xx - k(3.0) * yy);
+        b[13] = -k(C3[2]) * x * (k(4.0) * zz - xx - yy);
+        b[14] = k(C3[4]) * z * (xx - yy);
+        b[15] = -k(C3[0]) * x * (xx - k(3.0) * yy);
+    }
+    b
+}
+
+/// Derivatives of [`basis`] by x, y and z.
+#[inline(always)]
+fn basis_gradient<T: Real>(degree: usize, [x, y, z]: Vec3<T>) -> [Vec3<T>; COUNT_MAX] {
+    let k = T::of;
+    let o = T::ZERO;
+    let mut d = [[o; 3]; COUNT_MAX];
+    if degree >= 1 {
+        d[1] = [o, -k(C1), o];
+        d[2] = [o, o, k(C1)];
+        d[3] = [-k(C1), o, o];
+    }
+    let (xx, yy, zz) = (x * x, y * y, z * z);
+    if degree >= 2 {
+        d[4] = scale([y, x, o], k(C2[0]));
+        d[5] = scale([o, z, y], -k(C2[0]));
+        d[6] = scale([-x, -y, k(2.0) * z], k(2.0 * C2[1]));
+        d[7] = scale([z, o, x], -k(C2[0]));
+        d[8] = scale([x, -y, o], k(2.0 * C2[2]));
+    }
+    if degree >= 3 {
+        d[9] = scale([k(6.0) * x * y, k(3.0) * (xx - yy), o], -k(C3[0]));
+        d[10] = scale([y * z, x * z, x * y], k(C3[1]));
+        d[11] = scale(
+            [-k(2.0) * x * y, k(4.0) * zz - xx - k(3.0) * yy, k(8.0) * y * z],
+            -k(C3[2]),
+        );
+        d[12] = scale(
+            [-k(6.0) * x * z, -k(6.0) * y * z, k(6.0) * zz - k(3.0) * (xx + yy)],
+            k(C3[3]),
+        );
+        d[13] = scale(
+            [k(4.0) * zz - k(3.0) * xx - yy, -k(2.0) * x * y, k(8.0) * x * z],
+            -k(C3[2]),
+        );
+        d[14] = scale([k(2.0) * x * z, -k(2.0) * y * z, xx - yy], k(C3[4]));
+        d[15] = scale([k(3.0) * (xx - yy), -k(6.0) * x * y, o], -k(C3[0]));
+    }
+    d
+}
+
+/// Unit vector and one over the length; both zero for the zero vector.
+#[inline(always)]
+fn normalize<T: Real>(v: Vec3<T>) -> (Vec3<T>, T) {
+    let largest = v.iter().fold(T::ZERO, |m, x| m.greatest(x.abs()));
+    if !(largest > T::ZERO) {
+        return ([T::ZERO; 3], T::ZERO);
+    }
+    let scaled = v.map(|x| x / largest);
+    let length = dot(scaled, scaled).sqrt();
+    (scaled.map(|x| x / length), T::ONE / (length * largest))
+}
+
+fn direction<T: Real>(dirs: &[T], row: usize) -> Vec3<T> {
+    core::array::from_fn(|i| dirs[3 * row + i])
+}
+
+pub(super) fn forward<T: Real>(
+    _: PhantomData<T>,
+    coeffs: FlexTensor,
+    dirs: FlexTensor,
+    degree: usize,
+) -> FlexTensor {
+    let (coeffs, dirs) = (Buffer::new(coeffs), Buffer::new(dirs));
+    let [n, k, _] = coeffs.dims();
+    let [c, _, _] = dirs.dims();
+    let (coeffs, dirs) = (coeffs.slice::<T>(), dirs.slice::<T>());
+    let count = sh_coefficient_count(degree);
+    let mut colors = vec![T::ZERO; c * n * 3];
+    colors
+        .par_chunks_mut(3)
+        .with_min_len(CHUNK)
+        .enumerate()
+        .for_each(|(row, color)| {
+            let coeffs = &coeffs[row % n * k * 3..][..count * 3];
+            let basis = basis(degree, normalize(direction(dirs, row)).0);
+            for (coeff, value) in coeffs.chunks_exact(3).zip(basis) {
+                for (color, coeff) in color.iter_mut().zip(coeff) {
+                    *color += value * *coeff;
+                }
+            }
+        });
+    tensor(colors, [c, n, 3])
+}
+
+pub(super) fn backward<T: Real>(
+    _: PhantomData<T>,
+    coeffs: FlexTensor,
+    dirs: FlexTensor,
+    grad: FlexTensor,
+    degree: usize,
+    wanted: [bool; 2],
+) -> [Option<FlexTensor>; 2] {
+    let (coeffs, dirs, grad) = (Buffer::new(coeffs), Buffer::new(dirs), Buffer::new(grad));
+    let [n, k, _] = coeffs.dims();
+    let [c, _, _] = dirs.dims();
+    let (coeffs, dirs, grad) = (coeffs.slice::<T>(), dirs.slice::<T>(), grad.slice::<T>());
+    let count = sh_coefficient_count(degree);
+
+    // color = sum_i B_i(d) coeff_i: a coefficient's gradient is B_i(d) times the colour's, summed
+    // over the cameras.
+    let grad_coeffs = wanted[0].then(|| {
+        let mut values = vec![T::ZERO; n * k * 3];
+        values
+            .par_chunks_mut(k * 3)
+            .with_min_len(CHUNK)
+            .enumerate()
+            .for_each(|(index, out)| {
+                for camera in 0..c {
+                    let row = camera * n + index;
+                    let basis = basis(degree, normalize(direction(dirs, row)).0);
+                    let grad = &grad[3 * row..3 * row + 3];
+                    for (out, value) in out.chunks_exact_mut(3).zip(&basis[..count]) {
+                        for (out, grad) in out.iter_mut().zip(grad) {
+                            *out += *value * *grad;
+                        }
+                    }
+                }
+            });
+        tensor(values, [n, k, 3])
+    });
+
+    // d = v / |v|: the gradient of v is what is tangential, divided by |v|.
+    let grad_dirs = wanted[1].then(|| {
+        let mut values = vec![T::ZERO; c * n * 3];
+        values
+            .par_chunks_mut(3)
+            .with_min_len(CHUNK)
+            .enumerate()
+            .for_each(|(row, out)| {
+                let (unit, inverse_length) = normalize(direction(dirs, row));
+                let coeffs = &coeffs[row % n * k * 3..][..count * 3];
+                let grad: Vec3<T> = core::array::from_fn(|i| grad[3 * row + i]);
+                let mut sum = [T::ZERO; 3];
+                for (coeff, derivative) in
+                    coeffs.chunks_exact(3).zip(basis_gradient(degree, unit))
+                {
+                    let weight = dot(grad, [coeff[0], coeff[1], coeff[2]]);
+                    for (sum, derivative) in sum.iter_mut().zip(derivative) {
+                        *sum += weight * derivative;
+                    }
+                }
+                let radial = dot(sum, unit);
+                for i in 0..3 {
+                    out[i] = (sum[i] - unit[i] * radial) * inverse_length;
+                }
+            });
+        tensor(values, [c, n, 3])
+    });
+    [grad_coeffs, grad_dirs]
+}

@@ -1,0 +1,1 @@
+//! Launches `splat-kernels` on CubeCL devices: CUDA, Vulkan, Metal, WebGPU.

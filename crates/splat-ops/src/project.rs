@@ -1,0 +1,175 @@
+//! Projection of 3D Gaussians to screen splats (3DGS section 4; Zwicker et al. 2001, EWA).
+
+use burn::backend::Dispatch;
+use burn::tensor::Tensor;
+
+use crate::backend::{PROJECTED_WIDTH, SplatOps};
+use crate::check::Checker;
+use crate::settings::ProjectArgs;
+use crate::{ImageSize, OpError, ProjectSettings};
+
+/// Screen splats of N Gaussians in C cameras, as [`project`] returns them.
+///
+/// One packed tensor `[C, N, 9]`, because an op tracked by autodiff has one output; the accessors
+/// slice it with ordinary differentiable ops. Rows of culled splats are zero.
+#[derive(Debug, Clone)]
+pub struct Projected {
+    packed: Tensor<3>,
+    size: ImageSize,
+}
+
+impl Projected {
+    /// Splats that come from somewhere else than [`project`], for example from another camera
+    /// model: `[C, N, 9]` with the columns of [`packed`](Self::packed).
+    ///
+    /// # Errors
+    /// When the last dimension is not 9 or the image has no pixels.
+    pub fn from_packed(packed: Tensor<3>, size: ImageSize) -> Result<Self, OpError> {
+        let check = Checker::new("Projected", "packed", &packed)?;
+        check.tensor(
+            "packed",
+            &packed,
+            [None, None, Some(PROJECTED_WIDTH)],
+            "[C, N, 9]",
+        )?;
+        check_size(&check, size)?;
+        Ok(Self { packed, size })
+    }
+
+    /// `[C, N, 9]`: mean x, mean y, depth, w11, w21, w22, compensation, extent x, extent y.
+    pub fn packed(&self) -> Tensor<3> {
+        self.packed.clone()
+    }
+
+    /// Screen means `[C, N, 2]`, in pixels.
+    pub fn means2d(&self) -> Tensor<3> {
+        self.columns(0, 2)
+    }
+
+    /// Camera z `[C, N]`, in world units.
+    pub fn depths(&self) -> Tensor<2> {
+        self.columns(2, 1).squeeze_dim(2)
+    }
+
+    /// Inverse Cholesky factor (w11, w21, w22) `[C, N, 3]` of the 2D covariance, in 1 / pixels:
+    /// a pixel at offset (dx, dy) from the mean has
+    /// `sigma = ((w11 dx)^2 + (w21 dx + w22 dy)^2) / 2`.
+    pub fn inverse_cholesky(&self) -> Tensor<3> {
+        self.columns(3, 3)
+    }
+
+    /// `[C, N]`: the factor `sqrt(det before / det after the low-pass filter)` by which
+    /// anti-aliased rendering multiplies the opacity (Yu et al. 2024, Mip-Splatting).
+    pub fn compensations(&self) -> Tensor<2> {
+        self.columns(6, 1).squeeze_dim(2)
+    }
+
+    /// Half sizes `[C, N, 2]` of the box that holds every pixel with alpha >= `alpha_min`, in
+    /// pixels; zero for culled splats. Carries no gradient.
+    pub fn extents(&self) -> Tensor<3> {
+        self.columns(7, 2).detach()
+    }
+
+    /// The image these splats are for.
+    pub fn image_size(&self) -> ImageSize {
+        self.size
+    }
+
+    /// Adds a zero leaf `[C, N, 2]` to the screen means, so that after the backward pass the
+    /// leaf's gradient is that of the screen means (density control reads it; 3DGS section 5.2).
+    ///
+    /// # Errors
+    /// When the probe is not `[C, N, 2]`.
+    pub fn with_screen_probe(self, probe: Tensor<3>) -> Result<Self, OpError> {
+        let check = Checker::new("Projected", "packed", &self.packed)?;
+        let [c, n, _] = self.packed.dims();
+        check.tensor("probe", &probe, [Some(c), Some(n), Some(2)], "[C, N, 2]")?;
+        let rest = Tensor::zeros(
+            [c, n, PROJECTED_WIDTH - 2],
+            (&probe.device(), probe.dtype()),
+        );
+        Ok(Self {
+            packed: self.packed + Tensor::cat(vec![probe, rest], 2),
+            size: self.size,
+        })
+    }
+
+    fn columns(&self, start: usize, length: usize) -> Tensor<3> {
+        self.packed.clone().narrow(2, start, length)
+    }
+}
+
+/// Projects Gaussians to screen splats (3DGS eq. 5, the affine approximation of EWA splatting).
+///
+/// # Arguments
+/// - `means` `[N, 3]`: world space.
+/// - `quats` `[N, 4]`: (w, x, y, z), any non-zero length; normalised here.
+/// - `scales` `[N, 3]`: linear standard deviations, world units.
+/// - `viewmats` `[C, 4, 4]`: world to camera. The gradient treats the upper twelve entries as
+///   independent; the bottom row's is zero.
+/// - `intrinsics` `[C, 4]`: fx, fy, cx, cy in pixels.
+/// - `size`: image size, for culling and for the clamp of the Jacobian.
+///
+/// The 2D covariance is `V V^T + eps2d I`, V = J W R diag(s), with its determinant from the
+/// minors of V, which keeps needles exact in single precision. Splats are culled (row of zeros, no
+/// gradient) when their depth is outside [near, far], when they do not reach the image, when their
+/// quaternion has no length, or when one of their fields is not finite.
+///
+/// # Errors
+/// When shapes, types or devices do not fit, or the image has no pixels.
+pub fn project(
+    means: Tensor<2>,
+    quats: Tensor<2>,
+    scales: Tensor<2>,
+    viewmats: Tensor<3>,
+    intrinsics: Tensor<2>,
+    size: ImageSize,
+    settings: &ProjectSettings,
+) -> Result<Projected, OpError> {
+    let check = Checker::new("project", "means", &means)?;
+    let [n, _] = means.dims();
+    let [c, _, _] = viewmats.dims();
+    check.tensor("means", &means, [None, Some(3)], "[N, 3]")?;
+    check.tensor("quats", &quats, [Some(n), Some(4)], "[N, 4]")?;
+    check.tensor("scales", &scales, [Some(n), Some(3)], "[N, 3]")?;
+    check.tensor(
+        "viewmats",
+        &viewmats,
+        [None, Some(4), Some(4)],
+        "[C, 4, 4]",
+    )?;
+    check.tensor("intrinsics", &intrinsics, [Some(c), Some(4)], "[C, 4]")?;
+    check_size(&check, size)?;
+    if c == 0 {
+        return Err(check.argument("needs at least one camera".into()));
+    }
+
+    let packed = <Dispatch as SplatOps>::project(
+        means.into_dispatch(),
+        quats.into_dispatch(),
+        scales.into_dispatch(),
+        viewmats.into_dispatch(),
+        intrinsics.into_dispatch(),
+        ProjectArgs {
+            size,
+            settings: *settings,
+        },
+    );
+    Ok(Projected {
+        packed: Tensor::from_dispatch(packed),
+        size,
+    })
+}
+
+/// An image needs pixels, and pixel coordinates must be exact in single precision.
+fn check_size(check: &Checker, size: ImageSize) -> Result<(), OpError> {
+    const LARGEST: u32 = 65_536;
+    let side = 1..=LARGEST;
+    if side.contains(&size.width) && side.contains(&size.height) {
+        return Ok(());
+    }
+    Err(check.argument(format!(
+        "an image of {} x {} pixels; each side must be 1 to {LARGEST}",
+        size.width, size.height
+    )))
+}

@@ -1,0 +1,111 @@
+//! Tile rasterisation: bin, sort, blend (3DGS section 6 and appendix C).
+
+use burn::backend::Dispatch;
+use burn::tensor::Tensor;
+
+use crate::backend::SplatOps;
+use crate::check::Checker;
+use crate::settings::RasterizeArgs;
+use crate::{OpError, Projected, RasterizeSettings};
+
+/// An image of D channels and its alpha, as [`rasterize`] returns them.
+#[derive(Debug, Clone)]
+pub struct Rendered {
+    packed: Tensor<4>,
+}
+
+impl Rendered {
+    /// `[C, H, W, D + 1]`: the channels, then alpha.
+    pub fn packed(&self) -> Tensor<4> {
+        self.packed.clone()
+    }
+
+    /// `[C, H, W, D]`: blended channels, in front of the background where one was given.
+    pub fn image(&self) -> Tensor<4> {
+        let channels = self.packed.dims()[3] - 1;
+        self.packed.clone().narrow(3, 0, channels)
+    }
+
+    /// `[C, H, W, 1]`: accumulated opacity, one minus the final transmittance.
+    pub fn alpha(&self) -> Tensor<4> {
+        let channels = self.packed.dims()[3] - 1;
+        self.packed.clone().narrow(3, channels, 1)
+    }
+}
+
+/// Blends splats front to back (3DGS eq. 3, appendix C).
+///
+/// # Arguments
+/// - `projected`: from [`project`](crate::project).
+/// - `colors` `[C, N, D]` or `[N, D]`: any D >= 1 of features.
+/// - `opacities` `[C, N]` or `[N]`: in (0, 1).
+/// - `background` `[C, D]`: blended behind the splats with the final transmittance.
+///
+/// Splats are ordered by depth, ties by index. Per pixel `alpha = min(alpha_max, o exp(-sigma))`;
+/// a splat with less than `alpha_min` is skipped, and the pixel stops before its transmittance
+/// would fall below `transmittance_min`. Every splat that was blended gets gradients, to screen
+/// mean, inverse Cholesky factor, colour and opacity; depth and extent only order and cull.
+///
+/// # Errors
+/// When shapes, types or devices do not fit.
+pub fn rasterize<const DC: usize, const DO: usize>(
+    projected: &Projected,
+    colors: Tensor<DC>,
+    opacities: Tensor<DO>,
+    background: Option<Tensor<2>>,
+    settings: &RasterizeSettings,
+) -> Result<Rendered, OpError> {
+    let packed = projected.packed();
+    let [c, n, _] = packed.dims();
+    let check = Checker::new("rasterize", "projected", &packed)?;
+
+    let channels = *colors.dims().last().unwrap_or(&0);
+    let colors: Tensor<3> = match colors.dims().as_slice() {
+        [cc, cn, d] if *cc == c && *cn == n && *d > 0 => colors.reshape([c, n, channels]),
+        [cn, d] if *cn == n && *d > 0 => colors.reshape([1, n, channels]).expand([c, n, channels]),
+        other => {
+            return Err(OpError::Shape {
+                op: "rasterize",
+                tensor: "colors",
+                expected: "[C, N, D] or [N, D] with D >= 1",
+                got: other.to_vec(),
+            });
+        }
+    };
+    let opacities: Tensor<2> = match opacities.dims().as_slice() {
+        [oc, on] if *oc == c && *on == n => opacities.reshape([c, n]),
+        [on] if *on == n => opacities.reshape([1, n]).expand([c, n]),
+        other => {
+            return Err(OpError::Shape {
+                op: "rasterize",
+                tensor: "opacities",
+                expected: "[C, N] or [N]",
+                got: other.to_vec(),
+            });
+        }
+    };
+    check.tensor("colors", &colors, [None; 3], "[C, N, D]")?;
+    check.tensor("opacities", &opacities, [None; 2], "[C, N]")?;
+    if let Some(background) = &background {
+        check.tensor(
+            "background",
+            background,
+            [Some(c), Some(channels)],
+            "[C, D]",
+        )?;
+    }
+
+    let packed = <Dispatch as SplatOps>::rasterize(
+        packed.into_dispatch(),
+        colors.into_dispatch(),
+        opacities.into_dispatch(),
+        background.map(Tensor::into_dispatch),
+        RasterizeArgs {
+            size: projected.image_size(),
+            settings: *settings,
+        },
+    );
+    Ok(Rendered {
+        packed: Tensor::from_dispatch(packed),
+    })
+}

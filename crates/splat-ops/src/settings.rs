@@ -1,0 +1,83 @@
+//! Sizes and settings of the ops. Every constant of the method is a field here, with its default.
+
+/// Size of the rendered image in pixels. The centre of pixel (i, j) lies at (i + 0.5, j + 0.5).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageSize {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+/// Smallest opacity that still changes an 8-bit image (3DGS appendix C).
+const ALPHA_MIN: f64 = 1.0 / 255.0;
+
+/// Settings of [`project`](crate::project).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ProjectSettings {
+    /// Splats with camera z below this are culled. World units. Default 0.01 (gsplat).
+    pub near: f64,
+    /// Splats with camera z above this are culled. World units. Default 1e10 (gsplat).
+    pub far: f64,
+    /// Low-pass filter: variance added to the diagonal of the 2D covariance, in pixels squared.
+    /// Default 0.3 (3DGS reference implementation).
+    pub eps2d: f64,
+    /// The Jacobian of the projection is evaluated at most this share of the image's width
+    /// (height) outside of it. Default 0.15.
+    pub clamp_margin: f64,
+    /// Opacity at which a splat's extent ends. Default 1/255 (3DGS appendix C).
+    pub alpha_min: f64,
+}
+
+impl Default for ProjectSettings {
+    fn default() -> Self {
+        Self {
+            near: 0.01,
+            far: 1e10,
+            eps2d: 0.3,
+            clamp_margin: 0.15,
+            alpha_min: ALPHA_MIN,
+        }
+    }
+}
+
+/// Settings of [`rasterize`](crate::rasterize).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RasterizeSettings {
+    /// A splat is skipped at a pixel where its alpha is below this. Default 1/255 (3DGS appendix C).
+    pub alpha_min: f64,
+    /// Alpha is capped here; the gradient through a capped alpha is zero. Default 0.99 (3DGS appendix C).
+    pub alpha_max: f64,
+    /// A pixel stops before its transmittance would fall below this. Default 9.999e-5: the 1e-4 of
+    /// 3DGS appendix C less one part in 10,000, because two splats at the cap leave exactly 1e-4,
+    /// which rounds to either side.
+    pub transmittance_min: f64,
+}
+
+impl Default for RasterizeSettings {
+    fn default() -> Self {
+        Self {
+            alpha_min: ALPHA_MIN,
+            alpha_max: 0.99,
+            transmittance_min: 9.999e-5,
+        }
+    }
+}
+
+/// Everything but tensors that a backend needs to project.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ProjectArgs {
+    /// Image size.
+    pub size: ImageSize,
+    /// Settings.
+    pub settings: ProjectSettings,
+}
+
+/// Everything but tensors that a backend needs to rasterise.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RasterizeArgs {
+    /// Image size.
+    pub size: ImageSize,
+    /// Settings.
+    pub settings: RasterizeSettings,
+}

@@ -1,0 +1,57 @@
+//! View-dependent colour as spherical harmonics (3DGS section 4).
+
+use burn::backend::Dispatch;
+use burn::tensor::Tensor;
+
+use crate::OpError;
+use crate::backend::SplatOps;
+use crate::check::Checker;
+
+/// Highest degree of spherical harmonics.
+pub const SH_DEGREE_MAX: usize = 3;
+
+/// Number of basis functions up to a degree: `(degree + 1)^2`.
+pub const fn sh_coefficient_count(degree: usize) -> usize {
+    (degree + 1) * (degree + 1)
+}
+
+/// Evaluates real spherical harmonics in C x N directions.
+///
+/// # Arguments
+/// - `coeffs` `[N, K, 3]` with K >= (degree + 1)^2; the rest is not read and gets zero gradient.
+/// - `dirs` `[C, N, 3]`: from the camera to the Gaussian, any length; normalised here. A direction
+///   of length zero counts as the zero vector: it keeps degree 0 and has no gradient.
+/// - `degree`: 0 to 3.
+///
+/// Returns the plain sum `[C, N, 3]`, in the basis and with the constants of 3DGS. The model adds
+/// 0.5 and clamps at zero.
+///
+/// # Errors
+/// When the degree is above 3, or shapes, types or devices do not fit.
+pub fn spherical_harmonics(
+    coeffs: Tensor<3>,
+    dirs: Tensor<3>,
+    degree: usize,
+) -> Result<Tensor<3>, OpError> {
+    let check = Checker::new("spherical_harmonics", "coeffs", &coeffs)?;
+    let [n, k, _] = coeffs.dims();
+    check.tensor("coeffs", &coeffs, [None, None, Some(3)], "[N, K, 3]")?;
+    check.tensor("dirs", &dirs, [None, Some(n), Some(3)], "[C, N, 3]")?;
+    if degree > SH_DEGREE_MAX {
+        return Err(check.argument(format!(
+            "degree {degree} is not available; the highest is {SH_DEGREE_MAX}"
+        )));
+    }
+    if k < sh_coefficient_count(degree) {
+        return Err(check.argument(format!(
+            "degree {degree} needs {} coefficients, `coeffs` has {k}",
+            sh_coefficient_count(degree)
+        )));
+    }
+    let colors = <Dispatch as SplatOps>::spherical_harmonics(
+        coeffs.into_dispatch(),
+        dirs.into_dispatch(),
+        degree,
+    );
+    Ok(Tensor::from_dispatch(colors))
+}
