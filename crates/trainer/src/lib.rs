@@ -1,0 +1,3 @@
+//! Captures, the training loop, evaluation, reports, and the `splat` program.
+
+pub mod gradcheck;
