@@ -3,7 +3,7 @@
 
 use core::fmt::Debug;
 
-use burn::backend::{Backend, backend_extension, tensor::FloatTensor};
+use burn::backend::{Backend, ExtensionType, backend_extension, tensor::FloatTensor};
 // The expansion of `#[backend_extension]` names these.
 #[allow(unused_imports)]
 use burn::backend::{Autodiff, Dispatch};
@@ -91,6 +91,15 @@ pub trait SplatBackend: Backend {
     fn gaussian_blur(image: FloatTensor<Self>, window: &[f64]) -> FloatTensor<Self>;
 }
 
+/// An optional tensor, in the form in which Burn's dispatch can carry one.
+#[derive(ExtensionType)]
+pub(crate) enum Background<B: Backend> {
+    /// `[C, D]`.
+    Color(FloatTensor<B>),
+    /// Nothing lies behind the splats.
+    None,
+}
+
 /// The forward ops as Burn dispatches them: to Flex, to CubeCL, or through autodiff to either.
 #[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
 pub(crate) trait SplatOps: Backend {
@@ -113,7 +122,7 @@ pub(crate) trait SplatOps: Backend {
         packed: FloatTensor<Self>,
         colors: FloatTensor<Self>,
         opacities: FloatTensor<Self>,
-        background: Option<FloatTensor<Self>>,
+        #[extension_type] background: Background<Self>,
         args: RasterizeArgs,
     ) -> FloatTensor<Self>;
 
@@ -147,9 +156,13 @@ macro_rules! forward_only {
                 packed: FloatTensor<Self>,
                 colors: FloatTensor<Self>,
                 opacities: FloatTensor<Self>,
-                background: Option<FloatTensor<Self>>,
+                background: Background<Self>,
                 args: RasterizeArgs,
             ) -> FloatTensor<Self> {
+                let background = match background {
+                    Background::Color(color) => Some(color),
+                    Background::None => None,
+                };
                 Self::rasterize_forward(packed, colors, opacities, background, &args).0
             }
 

@@ -3,7 +3,7 @@
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 
-use crate::backend::SplatOps;
+use crate::backend::{Background, SplatOps};
 use crate::check::Checker;
 use crate::settings::RasterizeArgs;
 use crate::{OpError, Projected, RasterizeSettings};
@@ -99,7 +99,10 @@ pub fn rasterize<const DC: usize, const DO: usize>(
         packed.into_dispatch(),
         colors.into_dispatch(),
         opacities.into_dispatch(),
-        background.map(Tensor::into_dispatch),
+        match background {
+            Some(color) => Background::Color(color.into_dispatch()),
+            None => Background::None,
+        },
         RasterizeArgs {
             size: projected.image_size(),
             settings: *settings,

@@ -16,10 +16,11 @@ impl<B: SplatBackend> Backward<B, 1> for BlurBackward {
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
-        let value = ops.parents[0]
+        let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
+        let value = parents[0]
             .is_some()
             .then(|| B::gaussian_blur(grad, &ops.state));
-        register::<B, 1>(grads, ops.parents, [value]);
+        register::<B, 1>(grads, parents, [value]);
     }
 }
 

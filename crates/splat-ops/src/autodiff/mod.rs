@@ -9,10 +9,10 @@ mod spherical_harmonics;
 
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::graph::NodeRef;
+use burn::backend::autodiff::NodeId;
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
-use crate::backend::{SplatBackend, SplatOps};
+use crate::backend::{Background, SplatBackend, SplatOps};
 use crate::settings::{ProjectArgs, RasterizeArgs};
 
 impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
@@ -39,7 +39,7 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
         packed: FloatTensor<Self>,
         colors: FloatTensor<Self>,
         opacities: FloatTensor<Self>,
-        background: Option<FloatTensor<Self>>,
+        background: Background<Self>,
         args: RasterizeArgs,
     ) -> FloatTensor<Self> {
         rasterize::rasterize::<B, C>([packed, colors, opacities], background, args)
@@ -50,20 +50,15 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
     }
 }
 
-/// Which parents are tracked, in order.
-fn wanted<const N: usize>(parents: &[Option<NodeRef>; N]) -> [bool; N] {
-    parents.each_ref().map(Option::is_some)
-}
-
-/// Hands each parent its gradient.
+/// Hands each tracked parent its gradient.
 fn register<B: SplatBackend, const N: usize>(
     grads: &mut Gradients,
-    parents: [Option<NodeRef>; N],
+    parents: [Option<NodeId>; N],
     values: [Option<FloatTensor<B>>; N],
 ) {
     for (parent, value) in parents.into_iter().zip(values) {
         if let (Some(parent), Some(value)) = (parent, value) {
-            grads.register::<B>(parent.id, value);
+            grads.register::<B>(parent, value);
         }
     }
 }

@@ -5,7 +5,7 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
-use super::{register, wanted};
+use super::register;
 use crate::backend::SplatBackend;
 use crate::settings::ProjectArgs;
 
@@ -18,11 +18,12 @@ impl<B: SplatBackend> Backward<B, 5> for ProjectBackward {
     fn backward(self, ops: Ops<Self::State, 5>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
         let ([means, quats, scales, viewmats, intrinsics], args) = ops.state;
-        let wanted = wanted(&ops.parents);
+        let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
+        let wanted = parents.map(|parent| parent.is_some());
         let values = B::project_backward(
             means, quats, scales, viewmats, intrinsics, grad, &args, wanted,
         );
-        register::<B, 5>(grads, ops.parents, values);
+        register::<B, 5>(grads, parents, values);
     }
 }
 

@@ -6,8 +6,8 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
-use super::{register, wanted};
-use crate::backend::SplatBackend;
+use super::register;
+use crate::backend::{Background, SplatBackend};
 use crate::settings::RasterizeArgs;
 
 #[derive(Debug)]
@@ -44,11 +44,12 @@ impl<B: SplatBackend> Backward<B, 3> for RasterizeBackward {
 
     fn backward(self, ops: Ops<Self::State, 3>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
-        let [packed, colors, opacities] = wanted(&ops.parents);
+        let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
+        let [packed, colors, opacities] = parents.map(|parent| parent.is_some());
         let [packed, colors, opacities, _] = ops
             .state
             .gradients(grad, [packed, colors, opacities, false]);
-        register::<B, 3>(grads, ops.parents, [packed, colors, opacities]);
+        register::<B, 3>(grads, parents, [packed, colors, opacities]);
     }
 }
 
@@ -57,20 +58,21 @@ impl<B: SplatBackend> Backward<B, 4> for RasterizeBackward {
 
     fn backward(self, ops: Ops<Self::State, 4>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
-        let wanted = wanted(&ops.parents);
+        let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
+        let wanted = parents.map(|parent| parent.is_some());
         let values = ops.state.gradients(grad, wanted);
-        register::<B, 4>(grads, ops.parents, values);
+        register::<B, 4>(grads, parents, values);
     }
 }
 
 pub(super) fn rasterize<B: SplatBackend, C: CheckpointStrategy>(
     inputs: [FloatTensor<Autodiff<B, C>>; 3],
-    background: Option<FloatTensor<Autodiff<B, C>>>,
+    background: Background<Autodiff<B, C>>,
     args: RasterizeArgs,
 ) -> FloatTensor<Autodiff<B, C>> {
     let [packed, colors, opacities] = inputs.each_ref().map(|input| input.node());
     match background {
-        Some(background) => record::<B, C, 4>(
+        Background::Color(background) => record::<B, C, 4>(
             RasterizeBackward
                 .prepare::<C>([packed, colors, opacities, background.node()])
                 .compute_bound()
@@ -79,7 +81,7 @@ pub(super) fn rasterize<B: SplatBackend, C: CheckpointStrategy>(
             Some(background),
             args,
         ),
-        None => record::<B, C, 3>(
+        Background::None => record::<B, C, 3>(
             RasterizeBackward
                 .prepare::<C>([packed, colors, opacities])
                 .compute_bound()

@@ -5,7 +5,7 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
-use super::{register, wanted};
+use super::register;
 use crate::backend::SplatBackend;
 
 #[derive(Debug)]
@@ -17,9 +17,10 @@ impl<B: SplatBackend> Backward<B, 2> for SphericalHarmonicsBackward {
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
         let ([coeffs, dirs], degree) = ops.state;
-        let wanted = wanted(&ops.parents);
+        let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
+        let wanted = parents.map(|parent| parent.is_some());
         let values = B::spherical_harmonics_backward(coeffs, dirs, grad, degree, wanted);
-        register::<B, 2>(grads, ops.parents, values);
+        register::<B, 2>(grads, parents, values);
     }
 }
 

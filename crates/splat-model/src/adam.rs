@@ -1,0 +1,185 @@
+//! Adam (Kingma & Ba 2015) whose moments follow the rows of a parameter when density control adds,
+//! removes or reorders them.
+//!
+//! `ModuleOptimizer` keeps the states of its parameters to itself, so an edit reaches them through
+//! the optimiser: density control appends it to the [`EditLog`] that the optimiser shares, and every
+//! state applies, on its next step, the edits that it has not seen. Moments never leave the device.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use burn::optim::{LearningRate, Optimizer, RecordState};
+use burn::tensor::{Device, Int, Tensor};
+
+/// What happened to the rows of a parameter.
+#[derive(Debug, Clone)]
+pub enum RowEdit {
+    /// Row i of the new parameter continues row `source[i]` of the old one where `keep[i]` is one;
+    /// where it is zero its moments start anew.
+    Gather {
+        /// `[N_new]`, indices into the old rows.
+        source: Tensor<1, Int>,
+        /// `[N_new]`, one or zero.
+        keep: Tensor<1>,
+    },
+    /// All moments start anew; the values were overwritten.
+    Restart,
+}
+
+/// The edits of one parameter so far, shared between whoever edits it and its optimiser.
+#[derive(Debug, Clone, Default)]
+pub struct EditLog {
+    inner: Arc<Mutex<Edits>>,
+}
+
+#[derive(Debug, Default)]
+struct Edits {
+    /// Number of edits before `recent`; no state needs those any more.
+    forgotten: usize,
+    recent: Vec<RowEdit>,
+}
+
+impl EditLog {
+    /// Records an edit.
+    pub fn push(&self, edit: RowEdit) {
+        self.with(|edits| edits.recent.push(edit));
+    }
+
+    /// Continues the count of a saved run: states saved after `count` edits have seen them all.
+    pub fn resume(&self, count: usize) {
+        self.with(|edits| {
+            *edits = Edits {
+                forgotten: count,
+                recent: Vec::new(),
+            }
+        });
+    }
+
+    /// Number of edits so far.
+    pub fn count(&self) -> usize {
+        self.with(|edits| edits.forgotten + edits.recent.len())
+    }
+
+    /// Whether an edit waits for the optimiser's next step.
+    pub fn is_pending(&self) -> bool {
+        self.with(|edits| !edits.recent.is_empty())
+    }
+
+    /// The edits from number `seen` on. One log serves one parameter, so what is handed out is
+    /// forgotten.
+    fn take_since(&self, seen: usize) -> Vec<RowEdit> {
+        self.with(|edits| {
+            let skip = seen.saturating_sub(edits.forgotten).min(edits.recent.len());
+            let fresh = edits.recent.split_off(skip);
+            edits.forgotten += edits.recent.len() + fresh.len();
+            edits.recent.clear();
+            fresh
+        })
+    }
+
+    fn with<R>(&self, action: impl FnOnce(&mut Edits) -> R) -> R {
+        // A panic elsewhere cannot leave the list half-edited, so a poisoned lock is still good.
+        action(&mut self.inner.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+}
+
+/// Adam for one field of the Gaussians.
+#[derive(Debug, Clone)]
+pub struct SplatAdam {
+    /// Decay of the first moment.
+    pub beta_1: f64,
+    /// Decay of the second moment.
+    pub beta_2: f64,
+    /// Added to the root of the second moment.
+    pub epsilon: f64,
+    edits: EditLog,
+}
+
+impl SplatAdam {
+    /// The settings of 3DGS: betas 0.9 and 0.999, epsilon 1e-15.
+    pub fn new(edits: EditLog) -> Self {
+        Self {
+            beta_1: 0.9,
+            beta_2: 0.999,
+            epsilon: 1e-15,
+            edits,
+        }
+    }
+}
+
+/// Moments of one parameter.
+#[derive(Debug, Clone, RecordState)]
+pub struct SplatAdamState<const D: usize> {
+    /// Steps taken.
+    pub time: usize,
+    /// Number of edits of the [`EditLog`] that the moments have followed.
+    pub edits_seen: usize,
+    /// First moment, of the parameter's shape.
+    pub moment_1: Tensor<D>,
+    /// Second moment, of the parameter's shape.
+    pub moment_2: Tensor<D>,
+}
+
+impl<const D: usize> SplatAdamState<D> {
+    fn apply(&mut self, edit: RowEdit) {
+        let follow = |moment: Tensor<D>| match &edit {
+            RowEdit::Gather { source, keep } => {
+                let mut mask_shape = [1; D];
+                mask_shape[0] = keep.dims()[0];
+                moment.select(0, source.clone()) * keep.clone().reshape(mask_shape)
+            }
+            RowEdit::Restart => moment.zeros_like(),
+        };
+        self.moment_1 = follow(self.moment_1.clone());
+        self.moment_2 = follow(self.moment_2.clone());
+        self.edits_seen += 1;
+    }
+}
+
+impl Optimizer for SplatAdam {
+    type State<const D: usize> = SplatAdamState<D>;
+
+    fn step<const D: usize>(
+        &self,
+        lr: LearningRate,
+        tensor: Tensor<D>,
+        grad: Tensor<D>,
+        state: Option<Self::State<D>>,
+    ) -> (Tensor<D>, Option<Self::State<D>>) {
+        let mut state = match state {
+            Some(mut state) => {
+                for edit in self.edits.take_since(state.edits_seen) {
+                    state.apply(edit);
+                }
+                state
+            }
+            None => {
+                self.edits.take_since(0);
+                SplatAdamState {
+                    time: 0,
+                    edits_seen: self.edits.count(),
+                    moment_1: grad.zeros_like(),
+                    moment_2: grad.zeros_like(),
+                }
+            }
+        };
+        state.time += 1;
+        let time = state.time as f64;
+        let correction_1 = 1.0 - self.beta_1.powf(time);
+        let correction_2 = (1.0 - self.beta_2.powf(time)).sqrt();
+
+        state.moment_1 =
+            state.moment_1 * self.beta_1 + grad.clone() * (1.0 - self.beta_1);
+        state.moment_2 =
+            state.moment_2 * self.beta_2 + grad.square() * (1.0 - self.beta_2);
+        // m / c1 / (sqrt(v) / c2 + eps) = (c2 / c1) m / (sqrt(v) + c2 eps)
+        let root = state.moment_2.clone().sqrt() + correction_2 * self.epsilon;
+        let delta = state.moment_1.clone() / root * (lr * correction_2 / correction_1);
+        (tensor - delta, Some(state))
+    }
+
+    fn to_device<const D: usize>(mut state: Self::State<D>, device: &Device) -> Self::State<D> {
+        state.moment_1 = state.moment_1.to_device(device);
+        state.moment_2 = state.moment_2.to_device(device);
+        state
+    }
+}

@@ -1,0 +1,256 @@
+//! Adaptive density control of 3DGS (section 5.2), with the defaults of gsplat.
+
+use burn::tensor::{Tensor, linalg};
+use glam::{Quat, Vec3};
+use rand::SeedableRng;
+use rand_distr::{Distribution, StandardNormal};
+use rand_pcg::Pcg64Mcg;
+use serde::{Deserialize, Serialize};
+use splat_ops::ImageSize;
+
+use super::edit::{RowPlan, apply_plan, clamp_opacities};
+use crate::Gaussians;
+use crate::adam::EditLog;
+use crate::files::SplatData;
+use crate::gaussians::host;
+
+/// The run length that the milestones below are stated for.
+const REFERENCE_STEPS: f64 = 30_000.0;
+
+/// Settings of adaptive density control. Steps are those of a run of 30,000 and scale with it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct AdaptiveSettings {
+    /// First step after which rows may be added. Default 500.
+    pub start: usize,
+    /// Step after which no more rows are added or removed. Default 15,000.
+    pub stop: usize,
+    /// Steps between refinements; does not scale. Default 100.
+    pub every: usize,
+    /// Steps between opacity resets. Default 3,000.
+    pub reset_every: usize,
+    /// A Gaussian is cloned or split when its mean screen gradient exceeds this, in half images.
+    /// Default 2e-4.
+    pub grow_gradient: f64,
+    /// Above this share of the scene's scale a Gaussian is split, below it cloned. Default 0.01.
+    pub split_scale: f64,
+    /// Below this opacity a Gaussian is removed. Default 0.005.
+    pub prune_opacity: f64,
+    /// Above this share of the scene's scale a Gaussian is removed, once opacities have been reset.
+    /// Default 0.1.
+    pub prune_scale: f64,
+    /// Opacity that a reset leaves. Default 0.01.
+    pub reset_opacity: f64,
+    /// No growth beyond this many Gaussians. Default: none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub max_gaussians: Option<usize>,
+}
+
+impl Default for AdaptiveSettings {
+    fn default() -> Self {
+        Self {
+            start: 500,
+            stop: 15_000,
+            every: 100,
+            reset_every: 3_000,
+            grow_gradient: 2e-4,
+            split_scale: 0.01,
+            prune_opacity: 0.005,
+            prune_scale: 0.1,
+            reset_opacity: 0.01,
+            max_gaussians: None,
+        }
+    }
+}
+
+/// What of the run density control needs to know.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RunShape {
+    /// Steps of the whole run.
+    pub steps: usize,
+    /// See [`scene_scale`](crate::scene_scale).
+    pub scene_scale: f64,
+    /// Seed of the run.
+    pub seed: u64,
+}
+
+impl RunShape {
+    /// A milestone of a run of 30,000 steps in this run, at least 1. Longer runs keep it.
+    pub fn milestone(&self, step: usize) -> usize {
+        let share = (self.steps as f64 / REFERENCE_STEPS).min(1.0);
+        ((step as f64 * share).round() as usize).max(1)
+    }
+}
+
+/// What one refinement did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Refinement {
+    /// Small Gaussians that were duplicated.
+    pub cloned: usize,
+    /// Large Gaussians that were replaced by two smaller ones.
+    pub split: usize,
+    /// Gaussians removed for being transparent or too large.
+    pub pruned: usize,
+    /// Whether opacities were reset.
+    pub reset: bool,
+}
+
+/// The strategy: feed every step to [`observe`](Self::observe), then call [`refine`](Self::refine).
+#[derive(Debug, Clone)]
+pub struct AdaptiveDensity {
+    settings: AdaptiveSettings,
+    run: RunShape,
+    /// Per Gaussian, sum of screen gradients and number of views that saw it, since the last
+    /// refinement.
+    statistics: Option<(Tensor<1>, Tensor<1>)>,
+}
+
+impl AdaptiveDensity {
+    /// A strategy for one run.
+    pub fn new(settings: AdaptiveSettings, run: RunShape) -> Self {
+        Self {
+            settings,
+            run,
+            statistics: None,
+        }
+    }
+
+    /// Whether this step's screen gradients matter; without them no probe is needed.
+    pub fn observes(&self, step: usize) -> bool {
+        step < self.run.milestone(self.settings.stop)
+    }
+
+    /// Takes in a step: gradient of the screen means `[C, N, 2]`, extents `[C, N, 2]`.
+    pub fn observe(&mut self, screen_gradient: Tensor<3>, extents: Tensor<3>, size: ImageSize) {
+        let [cameras, n, _] = screen_gradient.dims();
+        // Pixels to half images, and the mean over cameras to a sum, as gsplat measures it.
+        let half = [size.width, size.height].map(|side| side as f32 / 2.0 * cameras as f32);
+        let half = Tensor::<1>::from_floats(half, &screen_gradient.device()).reshape([1, 1, 2]);
+        let seen = extents.inner().narrow(2, 0, 1).reshape([cameras, n]);
+        let seen = seen.greater_scalar(0.0).float();
+        let length = linalg::l2_norm(screen_gradient * half, 2).reshape([cameras, n]) * seen.clone();
+        let sum = length.sum_dim(0).reshape([n]);
+        let count = seen.sum_dim(0).reshape([n]);
+        self.statistics = Some(match self.statistics.take() {
+            Some((total, views)) if total.dims()[0] == n => (total + sum, views + count),
+            _ => (sum, count),
+        });
+    }
+
+    /// Sums of screen gradients and numbers of views per Gaussian so far, on the host, to be saved.
+    pub fn statistics(&self) -> Option<(Vec<f32>, Vec<f32>)> {
+        let (gradients, views) = self.statistics.clone()?;
+        Some((host(gradients), host(views)))
+    }
+
+    /// Puts back what [`statistics`](Self::statistics) gave.
+    pub fn restore_statistics(&mut self, gradients: Tensor<1>, views: Tensor<1>) {
+        self.statistics = Some((gradients, views));
+    }
+
+    /// After `step` (counted from 1): adds and removes rows when it is time to.
+    pub fn refine(
+        &mut self,
+        step: usize,
+        mut gaussians: Gaussians,
+        logs: &[EditLog; 6],
+    ) -> (Gaussians, Option<Refinement>) {
+        let settings = &self.settings;
+        if step > self.run.milestone(settings.stop) {
+            self.statistics = None;
+            return (gaussians, None);
+        }
+        let mut report = None;
+        let due = step > self.run.milestone(settings.start) && step.is_multiple_of(settings.every);
+        if due && let Some((total, views)) = self.statistics.take() {
+            let gradients: Vec<f64> = host(total)
+                .into_iter()
+                .zip(host(views))
+                .map(|(total, views)| f64::from(total) / f64::from(views.max(1.0)))
+                .collect();
+            let (plan, refinement) = self.plan(step, &gaussians.to_data(), &gradients);
+            if refinement != Refinement::default() {
+                gaussians = apply_plan(gaussians, &plan, logs);
+            }
+            report = Some(refinement);
+        }
+        if step.is_multiple_of(self.run.milestone(self.settings.reset_every))
+            && step < self.run.milestone(self.settings.stop)
+        {
+            gaussians = clamp_opacities(gaussians, self.settings.reset_opacity, logs);
+            report.get_or_insert_default().reset = true;
+        }
+        (gaussians, report)
+    }
+
+    /// Decides, from plain values: clones first, then splits, then what is pruned of it all.
+    fn plan(&self, step: usize, splats: &SplatData, gradients: &[f64]) -> (RowPlan, Refinement) {
+        let settings = &self.settings;
+        let scale = |row: usize| {
+            let largest = splats.log_scales[row].into_iter().fold(f32::MIN, f32::max);
+            f64::from(largest).exp() / self.run.scene_scale
+        };
+        let room = settings
+            .max_gaussians
+            .map_or(usize::MAX, |most| most.saturating_sub(splats.len()));
+        let mut report = Refinement::default();
+        let mut plan = RowPlan::default();
+        let mut clones = Vec::new();
+        let mut splits = Vec::new();
+        for row in 0..splats.len() {
+            let grows = gradients[row] > settings.grow_gradient && clones.len() + splits.len() < room;
+            if grows && scale(row) > settings.split_scale {
+                splits.push(row);
+                continue;
+            }
+            plan.keep(row as u32);
+            if grows {
+                clones.push(row);
+            }
+        }
+        for row in &clones {
+            plan.add(*row as u32, [0.0; 3], 0.0);
+        }
+        let smaller = -(1.6f32.ln());
+        for row in &splits {
+            for half in 0..2 {
+                plan.add(*row as u32, self.sample(step, *row, half, splats), smaller);
+            }
+        }
+        (report.cloned, report.split) = (clones.len(), splits.len());
+
+        let after_reset = step > self.run.milestone(settings.reset_every);
+        let before = plan.source.len();
+        let decisions: Vec<bool> = plan
+            .source
+            .iter()
+            .zip(&plan.log_scale_offset)
+            .map(|(row, offset)| {
+                let row = *row as usize;
+                let opacity = 1.0 / (1.0 + f64::from(-splats.opacity_logits[row]).exp());
+                let large = scale(row) * f64::from(*offset).exp() > settings.prune_scale;
+                opacity >= settings.prune_opacity && !(after_reset && large)
+            })
+            .collect();
+        // A model that would lose every row keeps them: nothing could grow back.
+        if decisions.contains(&true) {
+            plan.retain(|row| decisions[row]);
+        }
+        report.pruned = before - plan.source.len();
+        (plan, report)
+    }
+
+    /// A draw from the Gaussian around its mean, from (seed, step, row, half) alone.
+    fn sample(&self, step: usize, row: usize, half: u64, splats: &SplatData) -> [f32; 3] {
+        let id = (row as u64) * 2 + half;
+        let seed = self.run.seed ^ (step as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        let mut rng = Pcg64Mcg::seed_from_u64(seed ^ id.wrapping_mul(0xD1B5_4A32_D192_ED03));
+        let normal = Vec3::from_array([(); 3].map(|()| StandardNormal.sample(&mut rng)));
+        let scales = Vec3::from_array(splats.log_scales[row]).exp();
+        let [w, x, y, z] = splats.quats[row];
+        let rotation = Quat::from_xyzw(x, y, z, w).normalize();
+        let offset = rotation * (scales * normal);
+        // A quaternion without length has no axes to draw along.
+        if offset.is_finite() { offset.to_array() } else { [0.0; 3] }
+    }
+}

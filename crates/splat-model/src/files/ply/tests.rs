@@ -1,0 +1,257 @@
+//! What the reader and the writer promise.
+
+use std::path::PathBuf;
+
+use tempfile::TempDir;
+
+use super::*;
+
+/// A scene whose every value is another one.
+fn scene(count: usize, sh_degree: usize) -> SplatData {
+    let mut next = 0.0f32;
+    let mut value = || {
+        next += 1.0;
+        (next * 0.7).sin() * 10.0
+    };
+    let mut scene = SplatData {
+        sh_degree,
+        ..SplatData::default()
+    };
+    for _ in 0..count {
+        scene.means.push(std::array::from_fn(|_| value()));
+        scene.log_scales.push(std::array::from_fn(|_| value()));
+        scene.quats.push(std::array::from_fn(|_| value()));
+        scene.opacity_logits.push(value());
+        scene.sh0.push(std::array::from_fn(|_| value()));
+        let rest = scene.sh_rest_len();
+        scene.sh_rest.extend((0..rest).map(|_| value()));
+    }
+    scene
+}
+
+fn file_in(folder: &TempDir) -> PathBuf {
+    folder.path().join("scene.ply")
+}
+
+/// Writes `bytes` as a file and returns the message of reading it, which must name the file in one line.
+fn error_of(bytes: &[u8]) -> SceneFileError {
+    let folder = TempDir::new().unwrap();
+    let path = file_in(&folder);
+    std::fs::write(&path, bytes).unwrap();
+    let error = read(&path).expect_err("the file is bad");
+    let message = error.to_string();
+    assert!(message.contains("scene.ply"), "`{message}`");
+    assert!(!message.contains('\n'), "`{message}`");
+    error
+}
+
+/// Header and values of `scene` as text, the properties turned back to front, without normals.
+fn ascii(scene: &SplatData, kind: &str) -> String {
+    let names = property_names(scene.sh_rest_len());
+    let keep = |i: &usize| !names[*i].starts_with('n');
+    let order: Vec<usize> = (0..names.len()).rev().filter(keep).collect();
+    let mut text = format!(
+        "ply\nformat ascii 1.0\ncomment by hand\nelement vertex {}\n",
+        scene.len()
+    );
+    for &i in &order {
+        text += &format!("property {kind} {}\n", names[i]);
+    }
+    text += "property list uchar int extra\nend_header\n";
+    let mut row = Row::new();
+    for index in 0..scene.len() {
+        row.fill(scene, index);
+        for &i in &order {
+            text += &format!("{} ", row.values[i]);
+        }
+        text += "2 5 6\n";
+    }
+    text
+}
+
+#[test]
+fn round_trip_is_exact_in_every_degree() {
+    let folder = TempDir::new().unwrap();
+    for degree in 0..=3 {
+        let mut scene = scene(7, degree);
+        scene.means[3] = [-0.0, f32::MIN_POSITIVE / 8.0, f32::MAX];
+        write(&file_in(&folder), &scene).unwrap();
+        let back = read(&file_in(&folder)).unwrap();
+        assert_eq!(back, scene);
+        assert_eq!(
+            back.means[3].map(f32::to_bits),
+            scene.means[3].map(f32::to_bits)
+        );
+    }
+    // Nothing is left beside the file.
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+}
+
+#[test]
+fn the_layout_is_that_of_3dgs() {
+    let folder = TempDir::new().unwrap();
+    let scene = scene(2, 1);
+    write(&file_in(&folder), &scene).unwrap();
+    let bytes = std::fs::read(file_in(&folder)).unwrap();
+    let header = "ply\nformat binary_little_endian 1.0\nelement vertex 2\n\
+        property float x\nproperty float y\nproperty float z\n\
+        property float nx\nproperty float ny\nproperty float nz\n\
+        property float f_dc_0\nproperty float f_dc_1\nproperty float f_dc_2\n\
+        property float f_rest_0\nproperty float f_rest_1\nproperty float f_rest_2\n\
+        property float f_rest_3\nproperty float f_rest_4\nproperty float f_rest_5\n\
+        property float f_rest_6\nproperty float f_rest_7\nproperty float f_rest_8\n\
+        property float opacity\n\
+        property float scale_0\nproperty float scale_1\nproperty float scale_2\n\
+        property float rot_0\nproperty float rot_1\nproperty float rot_2\nproperty float rot_3\n\
+        end_header\n";
+    assert_eq!(&bytes[..header.len()], header.as_bytes());
+    let values: Vec<f32> = bytes[header.len()..]
+        .chunks_exact(4)
+        .map(|b| f32::from_le_bytes([b[0], b[1], b[2], b[3]]))
+        .collect();
+    assert_eq!(values.len(), 2 * 26);
+    let second = &values[26..];
+    assert_eq!(second[..3], scene.means[1]);
+    assert_eq!(second[3..6], [0.0; 3]);
+    assert_eq!(second[6..9], scene.sh0[1]);
+    // Red of the three coefficients, then green, then blue.
+    let rest = &scene.sh_rest[9..];
+    let channel_major = [0, 3, 6, 1, 4, 7, 2, 5, 8].map(|i| rest[i]);
+    assert_eq!(second[9..18], channel_major);
+    assert_eq!(second[18], scene.opacity_logits[1]);
+    assert_eq!(second[19..22], scene.log_scales[1]);
+    assert_eq!(second[22..26], scene.quats[1]);
+}
+
+#[test]
+fn ascii_in_any_order_is_read() {
+    let folder = TempDir::new().unwrap();
+    for degree in [0, 2] {
+        let scene = scene(3, degree);
+        for kind in ["float", "double"] {
+            std::fs::write(file_in(&folder), ascii(&scene, kind)).unwrap();
+            assert_eq!(read(&file_in(&folder)).unwrap(), scene);
+        }
+    }
+}
+
+#[test]
+fn big_endian_doubles_behind_another_element_are_read() {
+    let scene = scene(2, 0);
+    let names = property_names(0);
+    let mut bytes = b"ply\nformat binary_big_endian 1.0\nelement camera 2\nproperty uchar id\n\
+        property list uchar short path\nelement vertex 2\n"
+        .to_vec();
+    for name in &names {
+        bytes.extend(format!("property double {name}\n").bytes());
+    }
+    bytes.extend(b"end_header\n");
+    bytes.extend([9, 2, 0, 1, 0, 2]);
+    bytes.extend([9, 0]);
+    let mut row = Row::new();
+    for index in 0..2 {
+        row.fill(&scene, index);
+        let doubles = row.values.iter().map(|&value| f64::from(value));
+        bytes.extend(doubles.flat_map(f64::to_be_bytes));
+    }
+    let folder = TempDir::new().unwrap();
+    std::fs::write(file_in(&folder), &bytes).unwrap();
+    assert_eq!(read(&file_in(&folder)).unwrap(), scene);
+}
+
+#[test]
+fn every_truncation_is_an_error() {
+    let folder = TempDir::new().unwrap();
+    write(&file_in(&folder), &scene(2, 0)).unwrap();
+    let bytes = std::fs::read(file_in(&folder)).unwrap();
+    for end in 0..bytes.len() {
+        error_of(&bytes[..end]);
+    }
+    let last = error_of(&bytes[..bytes.len() - 1]);
+    assert!(matches!(
+        last,
+        SceneFileError::Truncated {
+            index: 1,
+            count: 2,
+            ..
+        }
+    ));
+
+    let text = ascii(&scene(2, 0), "float");
+    let last_line = text.trim_end().rfind('\n').unwrap();
+    let last = error_of(&text.as_bytes()[..=last_line]);
+    assert!(matches!(last, SceneFileError::Truncated { index: 1, .. }));
+}
+
+#[test]
+fn a_damaged_count_is_no_huge_allocation() {
+    let folder = TempDir::new().unwrap();
+    write(&file_in(&folder), &scene(1, 3)).unwrap();
+    let bytes = std::fs::read(file_in(&folder)).unwrap();
+    let text = b"element vertex 1\n";
+    let at = bytes.windows(text.len()).position(|w| w == text).unwrap();
+    let mut damaged = bytes[..at].to_vec();
+    damaged.extend(format!("element vertex {}\n", u64::MAX).bytes());
+    damaged.extend(&bytes[at + text.len()..]);
+    let error = error_of(&damaged);
+    assert!(matches!(error, SceneFileError::Truncated { index: 1, .. }));
+}
+
+#[test]
+fn values_that_are_not_finite_are_named() {
+    let folder = TempDir::new().unwrap();
+    let good = scene(3, 1);
+    let text = ascii(&good, "float");
+    let value = good.sh_rest[9 + 3 * 2 + 1].to_string();
+    for bad in ["nan", "inf", "1e60"] {
+        let message = error_of(text.replacen(&value, bad, 1).as_bytes()).to_string();
+        // Coefficient 2 of green is f_rest_5.
+        assert!(message.contains("Gaussian 1: f_rest_5 is"), "{message}");
+    }
+    let message = error_of(text.replacen(&value, "x", 1).as_bytes()).to_string();
+    assert!(message.contains("Gaussian 1: f_rest_5 `x`"), "{message}");
+
+    let mut bad = good.clone();
+    bad.log_scales[2][1] = f32::NAN;
+    let path = file_in(&folder);
+    let message = write(&path, &bad).unwrap_err().to_string();
+    assert!(message.contains("Gaussian 2: scale_1 is NaN"), "{message}");
+    // Nothing is half-written.
+    assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
+}
+
+#[test]
+fn headers_that_do_not_fit_are_named() {
+    let text = ascii(&scene(2, 1), "float");
+    let without = |property: &str| text.replace(&format!("property float {property}\n"), "");
+    let message = |text: &str| error_of(text.as_bytes()).to_string();
+
+    for property in ["x", "f_dc_2", "opacity", "scale_1", "rot_3"] {
+        let message = message(&without(property));
+        assert!(message.contains(&format!("`{property}`")), "{message}");
+    }
+    assert!(message(&without("f_rest_8")).contains("8 properties f_rest_*"));
+    assert!(message(&text.replace("f_rest_8\n", "f_rest_9\n")).contains("`f_rest_8`"));
+    assert!(message(&text.replace("float rot_0", "list uchar float rot_0")).contains("`rot_0`"));
+    assert!(message(&text.replace("vertex 2", "vertex 0")).contains("no Gaussian"));
+    assert!(message(&text.replace("element vertex", "element point")).contains("`vertex`"));
+    assert!(message(&text.replace("float opacity", "uint packed_position")).contains("compressed"));
+    assert!(message("solid cube\n").contains("no PLY header"));
+    assert!(message("").contains("no PLY header"));
+    // A name given twice would shift every value behind it.
+    message(&text.replace("float f_dc_0", "float f_dc_1"));
+}
+
+#[test]
+fn arrays_that_do_not_fit_are_named() {
+    let folder = TempDir::new().unwrap();
+    let mut bad = scene(3, 1);
+    bad.sh_rest.pop();
+    let message = write(&file_in(&folder), &bad).unwrap_err().to_string();
+    assert!(
+        message.contains("sh_rest has 26 entries instead of 27"),
+        "{message}"
+    );
+    bad.sh_degree = 4;
+    assert!(write(&file_in(&folder), &bad).is_err());
+}

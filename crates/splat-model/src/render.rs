@@ -1,0 +1,89 @@
+//! The three ops composed: Gaussians and a camera to an image.
+
+use burn::tensor::Tensor;
+use splat_ops::{
+    OpError, ProjectSettings, Projected, RasterizeSettings, Rendered, project, rasterize,
+    spherical_harmonics,
+};
+
+use crate::{CameraTensors, Gaussians};
+
+/// How to render.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct RenderSettings {
+    /// Highest degree of spherical harmonics to evaluate; at most what the model has.
+    pub sh_degree: usize,
+    /// Multiply opacities by what the low-pass filter took away (Yu et al. 2024, Mip-Splatting).
+    pub antialias: bool,
+    /// Colour behind everything; black (and no work) without one.
+    pub background: Option<[f32; 3]>,
+    /// Settings of the projection.
+    pub project: ProjectSettings,
+    /// Settings of the rasteriser.
+    pub rasterize: RasterizeSettings,
+}
+
+/// Renders Gaussians in C cameras: the image `[C, H, W, 3]` and alpha `[C, H, W, 1]`.
+///
+/// # Errors
+/// See [`project`] and [`rasterize`].
+pub fn render(
+    gaussians: &Gaussians,
+    cameras: &CameraTensors,
+    settings: &RenderSettings,
+) -> Result<Rendered, OpError> {
+    let projected = project_gaussians(gaussians, cameras, settings)?;
+    render_projected(gaussians, &projected, cameras, settings)
+}
+
+/// The first half of [`render`]: screen splats.
+///
+/// # Errors
+/// See [`project`].
+pub fn project_gaussians(
+    gaussians: &Gaussians,
+    cameras: &CameraTensors,
+    settings: &RenderSettings,
+) -> Result<Projected, OpError> {
+    project(
+        gaussians.means.val(),
+        gaussians.quats.val(),
+        gaussians.scales(),
+        cameras.viewmats.clone(),
+        cameras.intrinsics.clone(),
+        cameras.size,
+        &settings.project,
+    )
+}
+
+/// The second half of [`render`]: colours and blending. Between the halves a trainer puts a screen
+/// probe, a researcher whatever is being researched.
+///
+/// # Errors
+/// See [`spherical_harmonics`] and [`rasterize`].
+pub fn render_projected(
+    gaussians: &Gaussians,
+    projected: &Projected,
+    cameras: &CameraTensors,
+    settings: &RenderSettings,
+) -> Result<Rendered, OpError> {
+    let degree = settings.sh_degree.min(gaussians.sh_degree());
+    let dirs = gaussians.means.val().unsqueeze::<3>() - cameras.centers();
+    let colors = spherical_harmonics(gaussians.sh_coefficients(degree), dirs, degree)?;
+    let colors = (colors + 0.5).clamp_min(0.0);
+    let background = settings.background.map(|color| {
+        let [cameras, _, _] = colors.dims();
+        Tensor::<1>::from_floats(color, &colors.device())
+            .unsqueeze::<2>()
+            .expand([cameras, 3])
+    });
+    let opacities = gaussians.opacities().unsqueeze::<2>();
+    let opacities = if settings.antialias {
+        opacities * projected.compensations()
+    } else {
+        let [cameras, _, _] = projected.packed().dims();
+        let n = gaussians.len();
+        opacities.expand([cameras, n])
+    };
+    rasterize(projected, colors, opacities, background, &settings.rasterize)
+}

@@ -1,0 +1,319 @@
+//! COLMAP's sparse model, whatever its encoding: where it lies, what it holds, and whether that makes sense.
+//!
+//! Format: <https://colmap.github.io/format.html>. Files that are not needed here (`rigs.bin`, `frames.bin`,
+//! `project.ini`) are left alone.
+
+use std::collections::{HashMap, HashSet};
+use std::path::{Path, PathBuf};
+
+use super::{CaptureError, CaptureWarning, Point, colmap_binary, colmap_text};
+
+/// A sparse model as read and checked: every number finite, every image's camera present, at least one image and
+/// one point.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct SparseModel {
+    /// Cameras by id.
+    pub cameras: HashMap<u32, Camera>,
+    /// Images, sorted by name.
+    pub images: Vec<Image>,
+    /// Points, in file order.
+    pub points: Vec<Point>,
+}
+
+/// A pinhole camera of the model.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Camera {
+    pub id: u32,
+    pub width: u32,
+    pub height: u32,
+    /// `[fx, fy, cx, cy]` in pixels, pixel centres at + 0.5 (COLMAP's convention is ours).
+    pub intrinsics: [f64; 4],
+}
+
+/// A registered image of the model.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Image {
+    pub id: u32,
+    pub camera_id: u32,
+    pub name: String,
+    /// Rotation from world to camera, (w, x, y, z), not necessarily of unit length.
+    pub quaternion: [f64; 4],
+    /// Translation from world to camera.
+    pub translation: [f64; 3],
+}
+
+impl Image {
+    /// World to camera, row-major 4x4, from the normalised quaternion and the translation.
+    pub fn viewmat(&self) -> [[f64; 4]; 4] {
+        let length = self.quaternion.iter().map(|q| q * q).sum::<f64>().sqrt();
+        let [w, x, y, z] = self.quaternion.map(|q| q / length);
+        let [tx, ty, tz] = self.translation;
+        [
+            [
+                1.0 - 2.0 * (y * y + z * z),
+                2.0 * (x * y - w * z),
+                2.0 * (x * z + w * y),
+                tx,
+            ],
+            [
+                2.0 * (x * y + w * z),
+                1.0 - 2.0 * (x * x + z * z),
+                2.0 * (y * z - w * x),
+                ty,
+            ],
+            [
+                2.0 * (x * z - w * y),
+                2.0 * (y * z + w * x),
+                1.0 - 2.0 * (x * x + y * y),
+                tz,
+            ],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    }
+}
+
+/// Camera models in the order of COLMAP's numbers, with how many parameters each has. New numbers are only ever
+/// appended, so what is missing here is refused by its number.
+const MODELS: [(&str, usize); 12] = [
+    ("SIMPLE_PINHOLE", 3),
+    ("PINHOLE", 4),
+    ("SIMPLE_RADIAL", 4),
+    ("RADIAL", 5),
+    ("OPENCV", 8),
+    ("OPENCV_FISHEYE", 8),
+    ("FULL_OPENCV", 12),
+    ("FOV", 5),
+    ("SIMPLE_RADIAL_FISHEYE", 4),
+    ("RADIAL_FISHEYE", 5),
+    ("THIN_PRISM_FISHEYE", 12),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
+];
+
+/// Name of the camera model with COLMAP's number.
+pub(super) fn model_name(number: i32) -> String {
+    let known = usize::try_from(number).ok().and_then(|n| MODELS.get(n));
+    known.map_or_else(|| format!("number {number}"), |(name, _)| name.to_string())
+}
+
+/// Number of parameters of a camera model that can be read.
+pub(super) fn pinhole_parameters(model: &str) -> Option<usize> {
+    MODELS[..2]
+        .iter()
+        .find(|(name, _)| *name == model)
+        .map(|&(_, count)| count)
+}
+
+/// `[fx, fy, cx, cy]` from the 3 parameters of `SIMPLE_PINHOLE` (f, cx, cy) or the 4 of `PINHOLE`.
+pub(super) fn pinhole_intrinsics(parameters: &[f64]) -> [f64; 4] {
+    match *parameters {
+        [f, cx, cy] => [f, f, cx, cy],
+        [fx, fy, cx, cy] => [fx, fy, cx, cy],
+        // Both readers read exactly `pinhole_parameters` numbers; anything else fails the checks below.
+        _ => [f64::NAN; 4],
+    }
+}
+
+/// Finds the model of the capture in `root`, reads and checks it.
+pub(super) fn read(root: &Path) -> Result<(SparseModel, Vec<CaptureWarning>), CaptureError> {
+    let (folder, warnings) = find_folder(root)?;
+    let files = ModelFiles::find(&folder)?;
+    let (cameras, images, points) = if files.binary {
+        (
+            colmap_binary::read_cameras(&files.cameras)?,
+            colmap_binary::read_images(&files.images)?,
+            colmap_binary::read_points(&files.points)?,
+        )
+    } else {
+        (
+            colmap_text::read_cameras(&files.cameras)?,
+            colmap_text::read_images(&files.images)?,
+            colmap_text::read_points(&files.points)?,
+        )
+    };
+    let model = assemble(&files, cameras, images, points)?;
+    Ok((model, warnings))
+}
+
+/// The folder that holds the model.
+fn find_folder(root: &Path) -> Result<(PathBuf, Vec<CaptureWarning>), CaptureError> {
+    let metadata = root.metadata().map_err(|source| CaptureError::Io {
+        path: root.to_path_buf(),
+        source,
+    })?;
+    if !metadata.is_dir() {
+        return Err(CaptureError::NotAFolder {
+            path: root.to_path_buf(),
+        });
+    }
+    let holds_model = |folder: &PathBuf| {
+        ["cameras.bin", "cameras.txt"]
+            .iter()
+            .any(|file| folder.join(file).is_file())
+    };
+    let sparse = root.join("sparse");
+    let candidates = [sparse.join("0"), sparse.clone(), root.to_path_buf()];
+    let Some(found) = candidates.into_iter().find(holds_model) else {
+        let json = ["transforms.json", "transforms_train.json"];
+        let hint = if json.iter().any(|file| root.join(file).is_file()) {
+            " (it looks like a nerfstudio or Blender capture, which cannot be read yet)"
+        } else {
+            ""
+        };
+        return Err(CaptureError::NoModel {
+            root: root.to_path_buf(),
+            hint,
+        });
+    };
+    let mut warnings = Vec::new();
+    if found == sparse.join("0") {
+        let others = (1..)
+            .take_while(|n: &u32| holds_model(&sparse.join(n.to_string())))
+            .count();
+        if others > 0 {
+            warnings.push(CaptureWarning::OtherModels {
+                used: found.clone(),
+                others,
+            });
+        }
+    }
+    Ok((found, warnings))
+}
+
+/// The three files of a model, all of one encoding.
+struct ModelFiles {
+    binary: bool,
+    cameras: PathBuf,
+    images: PathBuf,
+    points: PathBuf,
+}
+
+impl ModelFiles {
+    /// The binary files if all are there, else the text files; otherwise names the missing one of the encoding that
+    /// has the cameras.
+    fn find(folder: &Path) -> Result<Self, CaptureError> {
+        let of = |binary: bool| {
+            let file =
+                |stem: &str| folder.join(format!("{stem}.{}", if binary { "bin" } else { "txt" }));
+            Self {
+                binary,
+                cameras: file("cameras"),
+                images: file("images"),
+                points: file("points3D"),
+            }
+        };
+        let [binary, text] = [of(true), of(false)];
+        match (binary.missing(), text.missing()) {
+            (None, _) => Ok(binary),
+            (_, None) => Ok(text),
+            (Some(in_binary), Some(in_text)) => {
+                let path = if binary.cameras.is_file() {
+                    in_binary
+                } else {
+                    in_text
+                };
+                Err(CaptureError::MissingModelFile { path: path.clone() })
+            }
+        }
+    }
+
+    fn missing(&self) -> Option<&PathBuf> {
+        [&self.cameras, &self.images, &self.points]
+            .into_iter()
+            .find(|path| !path.is_file())
+    }
+}
+
+/// Checks the three lists one by one and against each other.
+fn assemble(
+    files: &ModelFiles,
+    cameras: Vec<Camera>,
+    mut images: Vec<Image>,
+    points: Vec<Point>,
+) -> Result<SparseModel, CaptureError> {
+    let mut by_id = HashMap::with_capacity(cameras.len());
+    for camera in cameras {
+        check_camera(&camera).map_err(|reason| CaptureError::BadRecord {
+            path: files.cameras.clone(),
+            record: format!("camera {}", camera.id),
+            reason,
+        })?;
+        by_id.insert(camera.id, camera);
+    }
+
+    if images.is_empty() {
+        return Err(CaptureError::NoImages {
+            path: files.images.clone(),
+        });
+    }
+    let mut names = HashSet::with_capacity(images.len());
+    for image in &images {
+        let unique = names.insert(image.name.as_str());
+        check_image(image, &by_id, unique).map_err(|reason| CaptureError::BadRecord {
+            path: files.images.clone(),
+            record: format!("image {} (`{}`)", image.id, image.name),
+            reason,
+        })?;
+    }
+    drop(names);
+    images.sort_by(|a, b| a.name.cmp(&b.name));
+
+    if points.is_empty() {
+        return Err(CaptureError::NoPoints {
+            path: files.points.clone(),
+        });
+    }
+    let is_finite = |point: &Point| point.position.iter().all(|x| x.is_finite());
+    if let Some(index) = points.iter().position(|point| !is_finite(point)) {
+        return Err(CaptureError::BadRecord {
+            path: files.points.clone(),
+            record: format!("point {index} (counted from 0)"),
+            reason: format!("its position {:?} is not finite", points[index].position),
+        });
+    }
+    Ok(SparseModel {
+        cameras: by_id,
+        images,
+        points,
+    })
+}
+
+fn check_camera(camera: &Camera) -> Result<(), String> {
+    let [fx, fy, cx, cy] = camera.intrinsics;
+    if camera.width == 0 || camera.height == 0 {
+        return Err(format!("its size is {}x{}", camera.width, camera.height));
+    }
+    // Guards are written so that NaN fails them.
+    let focal_ok = fx > 0.0 && fy > 0.0 && fx.is_finite() && fy.is_finite();
+    if !focal_ok || !cx.is_finite() || !cy.is_finite() {
+        return Err(format!(
+            "its parameters fx {fx}, fy {fy}, cx {cx}, cy {cy} are not a pinhole camera"
+        ));
+    }
+    Ok(())
+}
+
+fn check_image(image: &Image, cameras: &HashMap<u32, Camera>, unique: bool) -> Result<(), String> {
+    if !unique {
+        return Err("its name occurs twice".to_owned());
+    }
+    if !cameras.contains_key(&image.camera_id) {
+        return Err(format!(
+            "its camera {} is not among the cameras",
+            image.camera_id
+        ));
+    }
+    if !image.translation.iter().all(|x| x.is_finite()) {
+        return Err(format!(
+            "its translation {:?} is not finite",
+            image.translation
+        ));
+    }
+    let squared: f64 = image.quaternion.iter().map(|q| q * q).sum();
+    if !(squared.is_finite() && squared > 0.0) {
+        return Err(format!(
+            "its quaternion {:?} is not a rotation",
+            image.quaternion
+        ));
+    }
+    Ok(())
+}

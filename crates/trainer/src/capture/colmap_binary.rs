@@ -1,0 +1,243 @@
+//! COLMAP's binary files: little endian, packed, every list preceded by its length.
+//!
+//! Every length is checked against what is left of the file before anything is allocated for it, so a truncated or
+//! damaged file is an error and never a panic or a huge allocation.
+
+use std::fmt::Display;
+use std::path::Path;
+
+use super::colmap::{Camera, Image, model_name, pinhole_intrinsics, pinhole_parameters};
+use super::{CaptureError, Point};
+
+/// Bytes of a camera record up to its parameters, of the shortest image record and of the shortest point record.
+const MIN_CAMERA: usize = 4 + 4 + 8 + 8;
+const MIN_IMAGE: usize = 4 + 7 * 8 + 4 + 1 + 8;
+const MIN_POINT: usize = 8 + 3 * 8 + 3 + 8 + 8;
+/// Bytes of one keypoint (x, y, point id) and of one track entry (image id, keypoint index).
+const KEYPOINT: usize = 8 + 8 + 8;
+const TRACK_ENTRY: usize = 4 + 4;
+
+/// Reads `cameras.bin`.
+pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>, CaptureError> {
+    let bytes = read_file(path)?;
+    let mut reader = Reader::new(path, &bytes);
+    reader.records("camera", "cameras", MIN_CAMERA, |reader, record| {
+        let id = reader.u32(record, "id")?;
+        let model = model_name(reader.i32(record, "model")?);
+        let Some(parameters) = pinhole_parameters(&model) else {
+            return Err(CaptureError::UnsupportedCamera {
+                path: path.to_path_buf(),
+                camera_id: id,
+                model,
+            });
+        };
+        let width = reader.size(record, "width")?;
+        let height = reader.size(record, "height")?;
+        let mut values = [0.0; 4];
+        for value in &mut values[..parameters] {
+            *value = reader.f64(record, "parameters")?;
+        }
+        Ok(Camera {
+            id,
+            width,
+            height,
+            intrinsics: pinhole_intrinsics(&values[..parameters]),
+        })
+    })
+}
+
+/// Reads `images.bin`; the keypoints are skipped.
+pub(super) fn read_images(path: &Path) -> Result<Vec<Image>, CaptureError> {
+    let bytes = read_file(path)?;
+    let mut reader = Reader::new(path, &bytes);
+    reader.records("image", "images", MIN_IMAGE, |reader, record| {
+        let id = reader.u32(record, "id")?;
+        let quaternion = reader.f64s(record, "quaternion")?;
+        let translation = reader.f64s(record, "translation")?;
+        let camera_id = reader.u32(record, "camera id")?;
+        let name = reader.name(record)?;
+        reader.skip_list(record, "keypoints", KEYPOINT)?;
+        Ok(Image {
+            id,
+            camera_id,
+            name,
+            quaternion,
+            translation,
+        })
+    })
+}
+
+/// Reads `points3D.bin`; the tracks are skipped.
+pub(super) fn read_points(path: &Path) -> Result<Vec<Point>, CaptureError> {
+    let bytes = read_file(path)?;
+    let mut reader = Reader::new(path, &bytes);
+    reader.records("point", "points", MIN_POINT, |reader, record| {
+        reader.take::<8>(record, "id")?;
+        let position = reader.f64s(record, "position")?;
+        let color = reader.take::<3>(record, "colour")?;
+        reader.take::<8>(record, "error")?;
+        reader.skip_list(record, "track entries", TRACK_ENTRY)?;
+        Ok(Point { position, color })
+    })
+}
+
+fn read_file(path: &Path) -> Result<Vec<u8>, CaptureError> {
+    std::fs::read(path).map_err(|source| CaptureError::Io {
+        path: path.to_path_buf(),
+        source,
+    })
+}
+
+/// What is being read, for messages; formatted only when something is wrong.
+#[derive(Clone, Copy)]
+struct Record {
+    kind: &'static str,
+    index: usize,
+    count: usize,
+}
+
+impl Display for Record {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        if self.kind.is_empty() {
+            write!(f, "the file")
+        } else {
+            write!(f, "{} {} of {}", self.kind, self.index + 1, self.count)
+        }
+    }
+}
+
+/// The file itself as a record: the count at its start.
+const FILE: Record = Record {
+    kind: "",
+    index: 0,
+    count: 0,
+};
+
+/// A cursor over the bytes of a file.
+struct Reader<'a> {
+    path: &'a Path,
+    rest: &'a [u8],
+}
+
+impl<'a> Reader<'a> {
+    fn new(path: &'a Path, bytes: &'a [u8]) -> Self {
+        Self { path, rest: bytes }
+    }
+
+    /// Reads a count and then that many records.
+    fn records<T>(
+        &mut self,
+        kind: &'static str,
+        kinds: &'static str,
+        min_size: usize,
+        mut read: impl FnMut(&mut Self, Record) -> Result<T, CaptureError>,
+    ) -> Result<Vec<T>, CaptureError> {
+        let count = self.list_len(FILE, kinds, min_size)?;
+        (0..count)
+            .map(|index| read(self, Record { kind, index, count }))
+            .collect()
+    }
+
+    fn take<const N: usize>(
+        &mut self,
+        record: Record,
+        field: &'static str,
+    ) -> Result<[u8; N], CaptureError> {
+        let Some((head, rest)) = self.rest.split_first_chunk() else {
+            return Err(self.truncated(record, field));
+        };
+        self.rest = rest;
+        Ok(*head)
+    }
+
+    fn u32(&mut self, record: Record, field: &'static str) -> Result<u32, CaptureError> {
+        self.take(record, field).map(u32::from_le_bytes)
+    }
+
+    fn i32(&mut self, record: Record, field: &'static str) -> Result<i32, CaptureError> {
+        self.take(record, field).map(i32::from_le_bytes)
+    }
+
+    fn f64(&mut self, record: Record, field: &'static str) -> Result<f64, CaptureError> {
+        self.take(record, field).map(f64::from_le_bytes)
+    }
+
+    fn f64s<const N: usize>(
+        &mut self,
+        record: Record,
+        field: &'static str,
+    ) -> Result<[f64; N], CaptureError> {
+        let mut values = [0.0; N];
+        for value in &mut values {
+            *value = self.f64(record, field)?;
+        }
+        Ok(values)
+    }
+
+    /// A width or height: stored in 64 bits, at most 32 make sense.
+    fn size(&mut self, record: Record, field: &'static str) -> Result<u32, CaptureError> {
+        let value = self.take(record, field).map(u64::from_le_bytes)?;
+        u32::try_from(value).map_err(|_| CaptureError::BadRecord {
+            path: self.path.to_path_buf(),
+            record: record.to_string(),
+            reason: format!("its {field} is {value} pixels"),
+        })
+    }
+
+    /// A length that the rest of the file can hold, at `min_size` bytes an entry.
+    fn list_len(
+        &mut self,
+        record: Record,
+        what: &'static str,
+        min_size: usize,
+    ) -> Result<usize, CaptureError> {
+        let count = self.take(record, "count").map(u64::from_le_bytes)?;
+        let room = self.rest.len() / min_size;
+        match usize::try_from(count) {
+            Ok(len) if len <= room => Ok(len),
+            _ => Err(CaptureError::ImpossibleCount {
+                path: self.path.to_path_buf(),
+                record: record.to_string(),
+                what,
+                count,
+                remaining: self.rest.len(),
+            }),
+        }
+    }
+
+    fn skip_list(
+        &mut self,
+        record: Record,
+        what: &'static str,
+        entry: usize,
+    ) -> Result<(), CaptureError> {
+        let len = self.list_len(record, what, entry)?;
+        self.rest = &self.rest[len * entry..];
+        Ok(())
+    }
+
+    /// A name that ends with a zero byte.
+    fn name(&mut self, record: Record) -> Result<String, CaptureError> {
+        let Some(end) = self.rest.iter().position(|&byte| byte == 0) else {
+            return Err(self.truncated(record, "name"));
+        };
+        let name = &self.rest[..end];
+        self.rest = &self.rest[end + 1..];
+        match std::str::from_utf8(name) {
+            Ok(name) if !name.is_empty() => Ok(name.to_owned()),
+            _ => Err(CaptureError::BadRecord {
+                path: self.path.to_path_buf(),
+                record: record.to_string(),
+                reason: format!("its name `{}` is no text", name.escape_ascii()),
+            }),
+        }
+    }
+
+    fn truncated(&self, record: Record, field: &'static str) -> CaptureError {
+        CaptureError::Truncated {
+            path: self.path.to_path_buf(),
+            record: record.to_string(),
+            field,
+        }
+    }
+}

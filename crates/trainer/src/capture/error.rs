@@ -1,0 +1,271 @@
+//! What can be wrong with a capture, and what can be odd about it.
+
+use std::fmt;
+use std::path::PathBuf;
+
+/// Why a capture cannot be used. Every message is one line that names the file and the record, and says what to do
+/// where that is not plain.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum CaptureError {
+    /// A file or folder could not be read.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The capture's path is not a folder.
+    #[error("{}: not a folder; a capture is a folder with `images/` and `sparse/0/`", path.display())]
+    NotAFolder {
+        /// The path given.
+        path: PathBuf,
+    },
+    /// The folder holds no model.
+    #[error(
+        "{}: no COLMAP model: looked for cameras.bin and cameras.txt in `sparse/0`, `sparse` and the folder itself{hint}",
+        root.display()
+    )]
+    NoModel {
+        /// The capture's folder.
+        root: PathBuf,
+        /// What the folder seems to hold instead, or nothing.
+        hint: &'static str,
+    },
+    /// One of the three files of a model is missing.
+    #[error("{}: missing; a COLMAP model needs cameras, images and points3D, all .bin or all .txt", path.display())]
+    MissingModelFile {
+        /// The file.
+        path: PathBuf,
+    },
+    /// A binary file ends inside a record.
+    #[error("{}: truncated: the file ends in the {field} of {record}", path.display())]
+    Truncated {
+        /// The file.
+        path: PathBuf,
+        /// The record, such as `image 3 of 32`.
+        record: String,
+        /// The field being read.
+        field: &'static str,
+    },
+    /// A count in a file that the rest of the file has no room for.
+    #[error(
+        "{}: {record} announces {count} {what}, but the {remaining} bytes that follow cannot hold them; the file is truncated or damaged",
+        path.display()
+    )]
+    ImpossibleCount {
+        /// The file.
+        path: PathBuf,
+        /// The record that holds the count.
+        record: String,
+        /// What is counted.
+        what: &'static str,
+        /// The count.
+        count: u64,
+        /// Bytes left in the file.
+        remaining: usize,
+    },
+    /// A record that cannot be understood or makes no sense.
+    #[error("{}: {record}: {reason}", path.display())]
+    BadRecord {
+        /// The file.
+        path: PathBuf,
+        /// The record, such as `image 3 of 32` or `line 7`.
+        record: String,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// A camera model with distortion or of another kind.
+    #[error(
+        "{}: camera {camera_id} has the model {model}; only PINHOLE and SIMPLE_PINHOLE can be read, undistort the photos first (`colmap image_undistorter`)",
+        path.display()
+    )]
+    UnsupportedCamera {
+        /// The cameras file.
+        path: PathBuf,
+        /// Id of the camera.
+        camera_id: u32,
+        /// COLMAP's name of its model.
+        model: String,
+    },
+    /// A model without images.
+    #[error("{}: the model holds no image; the reconstruction found no camera, run it again with more overlap", path.display())]
+    NoImages {
+        /// The images file.
+        path: PathBuf,
+    },
+    /// A model without points.
+    #[error(
+        "{}: the model holds no point, and training starts from them; triangulate first (`colmap point_triangulator`)",
+        path.display()
+    )]
+    NoPoints {
+        /// The points file.
+        path: PathBuf,
+    },
+    /// The photo of an image of the model is not there.
+    #[error("{}: no such photo, but the model names the image `{image}`; restore it or remove it from the model", path.display())]
+    MissingPhoto {
+        /// Where the photo should be.
+        path: PathBuf,
+        /// Name of the image in the model.
+        image: String,
+    },
+    /// A photo that cannot be decoded.
+    #[error("{}: cannot be decoded as JPEG or PNG: {reason}", path.display())]
+    UndecodablePhoto {
+        /// The photo.
+        path: PathBuf,
+        /// What the decoder said.
+        reason: String,
+    },
+    /// A photo whose shape is not that of its camera.
+    #[error(
+        "{}: the photo is {}x{} pixels, but its camera {camera_id} is {}x{}; {}",
+        path.display(), photo[0], photo[1], camera[0], camera[1],
+        if photo[0] == camera[1] && photo[1] == camera[0] {
+            "it was rotated: use the photos the model was made from"
+        } else {
+            "use the photos the model was made from, or a uniform rescale of them"
+        }
+    )]
+    PhotoSize {
+        /// The photo.
+        path: PathBuf,
+        /// Its width and height.
+        photo: [u32; 2],
+        /// Id of its camera.
+        camera_id: u32,
+        /// The camera's width and height.
+        camera: [u32; 2],
+    },
+    /// A photo too small to compare by SSIM.
+    #[error(
+        "{}: the photo is {}x{} pixels{}; at least {min}x{min} are needed, the window of SSIM",
+        path.display(), size[0], size[1],
+        if *downscale > 1 { format!(" after --downscale {downscale}") } else { String::new() }
+    )]
+    PhotoTooSmall {
+        /// The photo.
+        path: PathBuf,
+        /// Its width and height, after downscaling.
+        size: [u32; 2],
+        /// The downscale factor.
+        downscale: u32,
+        /// Least width and height.
+        min: u32,
+    },
+    /// A `split.json` that cannot be used.
+    #[error("{}: {reason}", path.display())]
+    BadSplit {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// No view is left to train on.
+    #[error(
+        "{}: nothing to train on: of {photos} photo(s) all are held out; at least 2 are needed, since every 8th from the first is held out (or name a split in split.json)",
+        root.display()
+    )]
+    NothingToTrainOn {
+        /// The capture's folder.
+        root: PathBuf,
+        /// Number of photos.
+        photos: usize,
+    },
+    /// A downscale factor of 0.
+    #[error("downscale: the factor must be at least 1")]
+    ZeroDownscale,
+}
+
+/// Something odd about a capture that did not prevent reading it. `Display` gives one line.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum CaptureWarning {
+    /// Photos were rescaled without rewriting the cameras; the intrinsics were scaled to the photos.
+    RescaledPhotos {
+        /// Number of such photos.
+        count: usize,
+        /// The first of them.
+        first: String,
+        /// Its width and height.
+        photo: [u32; 2],
+        /// Its camera's width and height.
+        camera: [u32; 2],
+    },
+    /// Photos with transparent pixels; they were put on black.
+    TransparentPhotos {
+        /// Number of such photos.
+        count: usize,
+        /// The first of them.
+        first: String,
+    },
+    /// Photos in the folder that the model does not name; they are not used.
+    UnregisteredPhotos {
+        /// Number of such photos.
+        count: usize,
+        /// The first of them, by name.
+        first: String,
+    },
+    /// More than one model was found; only the first is read.
+    OtherModels {
+        /// The folder that was read.
+        used: PathBuf,
+        /// How many others lie beside it.
+        others: usize,
+    },
+    /// `split.json` names photos that the capture does not have.
+    SplitNamesUnknown {
+        /// Number of such names.
+        count: usize,
+        /// The first of them.
+        first: String,
+    },
+    /// `split.json` puts photos in neither list; they are not used.
+    SplitLeavesOut {
+        /// Number of such photos.
+        count: usize,
+        /// The first of them.
+        first: String,
+    },
+}
+
+impl fmt::Display for CaptureWarning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::RescaledPhotos {
+                count,
+                first,
+                photo,
+                camera,
+            } => write!(
+                f,
+                "{count} photo(s) differ in size from their camera, from `{first}` ({}x{} against {}x{}); the intrinsics were scaled to the photos",
+                photo[0], photo[1], camera[0], camera[1]
+            ),
+            Self::TransparentPhotos { count, first } => write!(
+                f,
+                "{count} photo(s) have transparent pixels, from `{first}`; they were put on black"
+            ),
+            Self::UnregisteredPhotos { count, first } => write!(
+                f,
+                "{count} photo(s) are not in the model and are not used, from `{first}`"
+            ),
+            Self::OtherModels { used, others } => write!(
+                f,
+                "only the model in {} is read; {others} other(s) lie beside it",
+                used.display()
+            ),
+            Self::SplitNamesUnknown { count, first } => write!(
+                f,
+                "split.json names {count} photo(s) that the capture does not have, from `{first}`"
+            ),
+            Self::SplitLeavesOut { count, first } => write!(
+                f,
+                "split.json puts {count} photo(s) in neither list; they are not used, from `{first}`"
+            ),
+        }
+    }
+}

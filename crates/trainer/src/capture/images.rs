@@ -1,0 +1,202 @@
+//! Photos: found, decoded once and in parallel, fitted to their cameras, kept as 8-bit RGB.
+
+use std::collections::HashSet;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use image::DynamicImage;
+use rayon::prelude::*;
+
+use super::colmap::{Camera, Image, SparseModel};
+use super::{CaptureError, CaptureWarning, View, downscale};
+
+/// Least width and height of a photo: the window of SSIM.
+const MIN_SIDE: u32 = 11;
+
+/// Loads the photo of every image of the model. The views come in the order of the model's images.
+pub(super) fn load(
+    root: &Path,
+    model: &SparseModel,
+    factor: u32,
+    warnings: &mut Vec<CaptureWarning>,
+) -> Result<Vec<View>, CaptureError> {
+    let folder = photo_folder(root);
+    // Look for every photo before decoding any: the likeliest mistake is found at once.
+    for image in &model.images {
+        let path = folder.join(&image.name);
+        if !path.is_file() {
+            return Err(CaptureError::MissingPhoto {
+                path,
+                image: image.name.clone(),
+            });
+        }
+    }
+    let loaded: Vec<Result<Loaded, CaptureError>> = model
+        .images
+        .par_iter()
+        .map(|image| load_one(&folder, image, &model.cameras[&image.camera_id], factor))
+        .collect();
+    let loaded = loaded.into_iter().collect::<Result<Vec<_>, _>>()?;
+    warnings.extend(rescaled(&loaded));
+    warnings.extend(transparent(&loaded));
+    warnings.extend(unregistered(root, model));
+    Ok(loaded.into_iter().map(|loaded| loaded.view).collect())
+}
+
+/// `images/` in the capture, or the capture itself if there is no such folder.
+fn photo_folder(root: &Path) -> PathBuf {
+    let images = root.join("images");
+    if images.is_dir() {
+        images
+    } else {
+        root.to_path_buf()
+    }
+}
+
+/// A view and what was odd about its photo.
+struct Loaded {
+    view: View,
+    transparent: bool,
+    /// Sizes of photo and camera where they differ.
+    rescaled: Option<[[u32; 2]; 2]>,
+}
+
+fn load_one(
+    folder: &Path,
+    image: &Image,
+    camera: &Camera,
+    factor: u32,
+) -> Result<Loaded, CaptureError> {
+    let path = folder.join(&image.name);
+    let photo = decode(&path)?;
+    let size = [photo.width(), photo.height()];
+    let camera_size = [camera.width, camera.height];
+    let Some(mut intrinsics) = fit_intrinsics(camera, size) else {
+        return Err(CaptureError::PhotoSize {
+            path,
+            photo: size,
+            camera_id: camera.id,
+            camera: camera_size,
+        });
+    };
+
+    let (mut pixels, transparent) = opaque_rgb(photo);
+    let [mut width, mut height] = size;
+    if factor > 1 {
+        (pixels, width, height) = downscale::area_average(&pixels, width, height, factor);
+        intrinsics = downscale::intrinsics(intrinsics, factor);
+    }
+    if width < MIN_SIDE || height < MIN_SIDE {
+        return Err(CaptureError::PhotoTooSmall {
+            path,
+            size: [width, height],
+            downscale: factor,
+            min: MIN_SIDE,
+        });
+    }
+    Ok(Loaded {
+        view: View {
+            name: image.name.clone(),
+            width,
+            height,
+            intrinsics,
+            viewmat: image.viewmat(),
+            image: Arc::new(pixels),
+        },
+        transparent,
+        rescaled: (size != camera_size).then_some([size, camera_size]),
+    })
+}
+
+/// Decodes a photo as stored: like COLMAP, without turning it by its EXIF orientation.
+fn decode(path: &Path) -> Result<DynamicImage, CaptureError> {
+    let io_error = |source| CaptureError::Io {
+        path: path.to_path_buf(),
+        source,
+    };
+    image::ImageReader::open(path)
+        .map_err(io_error)?
+        .with_guessed_format()
+        .map_err(io_error)?
+        .decode()
+        .map_err(|error| CaptureError::UndecodablePhoto {
+            path: path.to_path_buf(),
+            reason: error.to_string().replace('\n', " "),
+        })
+}
+
+/// The camera's intrinsics for a photo of `size`, or nothing where the photo's shape is not the camera's.
+///
+/// A rescale counts as uniform where one factor explains both sides to within a pixel (sizes are rounded). The sides
+/// are then scaled each by its own ratio, so that the photo's edges stay the camera's edges.
+fn fit_intrinsics(camera: &Camera, size: [u32; 2]) -> Option<[f64; 4]> {
+    let [fx, fy, cx, cy] = camera.intrinsics;
+    let [w, h] = size.map(f64::from);
+    let [cam_w, cam_h] = [camera.width, camera.height].map(f64::from);
+    let least = ((w - 1.0) / cam_w).max((h - 1.0) / cam_h);
+    let most = ((w + 1.0) / cam_w).min((h + 1.0) / cam_h);
+    let (sx, sy) = (w / cam_w, h / cam_h);
+    (least <= most).then_some([fx * sx, fy * sy, cx * sx, cy * sy])
+}
+
+/// 8-bit RGB, transparent pixels put on black; and whether there were any.
+fn opaque_rgb(photo: DynamicImage) -> (Vec<u8>, bool) {
+    if !photo.color().has_alpha() {
+        return (photo.into_rgb8().into_raw(), false);
+    }
+    let rgba = photo.into_rgba8();
+    let transparent = rgba.pixels().any(|pixel| pixel.0[3] != 255);
+    let on_black = |value: u8, alpha: u8| ((u32::from(value) * u32::from(alpha) + 127) / 255) as u8;
+    let pixels = rgba
+        .pixels()
+        .flat_map(|pixel| {
+            let [r, g, b, a] = pixel.0;
+            [on_black(r, a), on_black(g, a), on_black(b, a)]
+        })
+        .collect();
+    (pixels, transparent)
+}
+
+fn rescaled(loaded: &[Loaded]) -> Option<CaptureWarning> {
+    let mut odd = loaded
+        .iter()
+        .filter_map(|loaded| Some((&loaded.view.name, loaded.rescaled?)));
+    let (first, [photo, camera]) = odd.next()?;
+    Some(CaptureWarning::RescaledPhotos {
+        count: 1 + odd.count(),
+        first: first.clone(),
+        photo,
+        camera,
+    })
+}
+
+fn transparent(loaded: &[Loaded]) -> Option<CaptureWarning> {
+    let mut odd = loaded.iter().filter(|loaded| loaded.transparent);
+    let first = odd.next()?.view.name.clone();
+    Some(CaptureWarning::TransparentPhotos {
+        count: 1 + odd.count(),
+        first,
+    })
+}
+
+/// Photos directly in `images/` that the model does not name. Sub-folders and a capture without that folder are not
+/// searched: what lies there may be masks or anything else.
+fn unregistered(root: &Path, model: &SparseModel) -> Option<CaptureWarning> {
+    let registered: HashSet<&str> = model.images.iter().map(|i| i.name.as_str()).collect();
+    let is_photo = |name: &str| {
+        let extension = Path::new(name).extension().unwrap_or_default();
+        ["jpg", "jpeg", "png"]
+            .iter()
+            .any(|known| extension.eq_ignore_ascii_case(known))
+    };
+    let mut names: Vec<String> = std::fs::read_dir(root.join("images"))
+        .ok()?
+        .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
+        .filter(|name| is_photo(name) && !registered.contains(name.as_str()))
+        .collect();
+    names.sort();
+    Some(CaptureWarning::UnregisteredPhotos {
+        first: names.first()?.clone(),
+        count: names.len(),
+    })
+}

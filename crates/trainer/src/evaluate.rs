@@ -1,0 +1,67 @@
+//! Scores of a model on views it was not trained on.
+
+use burn::tensor::{Device, Tensor};
+use splat_model::losses::{SsimSettings, psnr, ssim};
+use splat_model::ops::OpError;
+use splat_model::{Gaussians, RenderSettings, render};
+
+use crate::capture::View;
+use crate::train::{camera, photo};
+
+/// Scores of one view.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ViewScore {
+    /// Name of the photo.
+    pub name: String,
+    /// Peak signal-to-noise ratio in dB, on images clamped to [0, 1].
+    pub psnr: f64,
+    /// Structural similarity, 11 x 11 Gaussian window, sigma 1.5.
+    pub ssim: f64,
+}
+
+/// Scores of several views and their means.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Scores {
+    /// Mean of the views' PSNR in dB.
+    pub psnr: f64,
+    /// Mean of the views' SSIM.
+    pub ssim: f64,
+    /// Per view.
+    pub views: Vec<ViewScore>,
+}
+
+/// Renders every view and compares it with its photo. `each` gets every view with its picture,
+/// `H x W x 3` values clamped to [0, 1], for whoever keeps pictures.
+///
+/// # Errors
+/// When an op refuses its input.
+pub fn evaluate(
+    gaussians: &Gaussians,
+    views: &[&View],
+    settings: &RenderSettings,
+    device: &Device,
+    mut each: impl FnMut(&View, Vec<f32>),
+) -> Result<Scores, OpError> {
+    let mut scores = Vec::with_capacity(views.len());
+    for view in views {
+        let rendered = render(gaussians, &camera(view).tensors(device), settings)?;
+        let image = rendered.image().clamp(0.0, 1.0);
+        let target = photo(view, device);
+        let scalar = |value: Tensor<1>| f64::from(value.into_scalar::<f32>());
+        scores.push(ViewScore {
+            name: view.name.clone(),
+            psnr: scalar(psnr(image.clone(), target.clone())),
+            ssim: scalar(ssim(image.clone(), target, &SsimSettings::default())?),
+        });
+        let picture = image.into_data().convert::<f32>();
+        each(view, picture.into_vec().unwrap_or_default());
+    }
+    let mean = |score: fn(&ViewScore) -> f64| {
+        scores.iter().map(score).sum::<f64>() / scores.len().max(1) as f64
+    };
+    Ok(Scores {
+        psnr: mean(|score| score.psnr),
+        ssim: mean(|score| score.ssim),
+        views: scores,
+    })
+}

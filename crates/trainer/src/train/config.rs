@@ -1,0 +1,105 @@
+//! Everything that determines a training run, apart from the capture and the loss.
+
+use serde::{Deserialize, Serialize};
+use splat_model::density::AdaptiveSettings;
+use splat_model::{InitSettings, LearningRates, RenderSettings};
+
+/// Settings of a training run; together with the capture and the seed they repeat it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrainConfig {
+    /// Number of steps; milestones stated for 30,000 steps shrink with shorter runs. Default 30,000.
+    pub steps: usize,
+    /// Seed of every random draw. Default 0.
+    pub seed: u64,
+    /// Photos are area-averaged by this factor. Default 1.
+    pub downscale: u32,
+    /// One more degree of spherical harmonics every so many steps of a run of 30,000. Default 1,000.
+    pub sh_degree_every: usize,
+    /// Multiply opacities by what the low-pass filter took away. Default false.
+    pub antialias: bool,
+    /// Colour behind the scene, linear RGB; black when absent.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub background: Option<[f32; 3]>,
+    /// Weight of 1 - SSIM against L1 in the default loss. Default 0.2.
+    pub ssim_weight: f64,
+    /// The first Gaussians.
+    pub init: InitSettings,
+    /// Learning rates.
+    pub rates: LearningRates,
+    /// Adaptive density control.
+    pub density: AdaptiveSettings,
+}
+
+impl Default for TrainConfig {
+    fn default() -> Self {
+        Self {
+            steps: 30_000,
+            seed: 0,
+            downscale: 1,
+            sh_degree_every: 1_000,
+            antialias: false,
+            background: None,
+            ssim_weight: 0.2,
+            init: InitSettings::default(),
+            rates: LearningRates::default(),
+            density: AdaptiveSettings::default(),
+        }
+    }
+}
+
+impl TrainConfig {
+    /// How to render at a degree of spherical harmonics.
+    pub fn render_settings(&self, sh_degree: usize) -> RenderSettings {
+        RenderSettings {
+            sh_degree,
+            antialias: self.antialias,
+            background: self.background,
+            ..RenderSettings::default()
+        }
+    }
+
+    /// What makes the settings unusable, if anything does: the field and the reason.
+    pub fn problem(&self) -> Option<String> {
+        let finite_positive = [
+            ("rates.means", self.rates.means),
+            ("rates.means_final", self.rates.means_final),
+            ("rates.scales", self.rates.scales),
+            ("rates.quats", self.rates.quats),
+            ("rates.opacities", self.rates.opacities),
+            ("rates.sh0", self.rates.sh0),
+            ("rates.sh_rest", self.rates.sh_rest),
+            ("init.scale", self.init.scale),
+        ];
+        let shares = [
+            ("init.opacity", self.init.opacity),
+            ("ssim_weight", self.ssim_weight),
+            ("density.prune_opacity", self.density.prune_opacity),
+            ("density.reset_opacity", self.density.reset_opacity),
+        ];
+        let counts = [
+            ("steps", self.steps),
+            ("sh_degree_every", self.sh_degree_every),
+            ("density.every", self.density.every),
+            ("density.reset_every", self.density.reset_every),
+        ];
+        if let Some((field, _)) = counts.iter().find(|(_, value)| *value == 0) {
+            return Some(format!("`{field}` must be at least 1"));
+        }
+        if self.downscale == 0 {
+            return Some("`downscale` must be at least 1".into());
+        }
+        if let Some((field, value)) = finite_positive
+            .iter()
+            .find(|(_, value)| !(value.is_finite() && *value > 0.0))
+        {
+            return Some(format!("`{field}` must be positive and finite, it is {value}"));
+        }
+        if let Some((field, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
+            return Some(format!("`{field}` must lie in [0, 1), it is {value}"));
+        }
+        let highest = splat_model::ops::SH_DEGREE_MAX;
+        (self.init.sh_degree > highest)
+            .then(|| format!("`init.sh_degree` must be 0 to {highest}, it is {}", self.init.sh_degree))
+    }
+}

@@ -1,0 +1,37 @@
+//! What a run has logged.
+
+use serde::{Deserialize, Serialize};
+
+/// Everything logged during a run.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct History {
+    /// Names of the loss's terms.
+    pub terms: Vec<String>,
+    /// One entry per step.
+    pub losses: Vec<LossRecord>,
+    /// Number of Gaussians whenever it changed, and at the beginning.
+    pub counts: Vec<(usize, usize)>,
+    /// Held-out PSNR in dB, by step, where it was measured.
+    pub held_out_psnr: Vec<(usize, f64)>,
+}
+
+/// The loss of one step.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct LossRecord {
+    /// The step, from 1.
+    pub step: usize,
+    /// The weighted sum.
+    pub total: f32,
+    /// The terms, without their weights.
+    pub terms: Vec<f32>,
+}
+
+impl History {
+    /// Mean total loss over the last `count` steps, if there were any.
+    pub fn mean_loss(&self, count: usize) -> Option<f64> {
+        let recent = &self.losses[self.losses.len().saturating_sub(count)..];
+        (!recent.is_empty()).then(|| {
+            recent.iter().map(|r| f64::from(r.total)).sum::<f64>() / recent.len() as f64
+        })
+    }
+}

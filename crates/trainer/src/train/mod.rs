@@ -1,0 +1,457 @@
+//! Training: render a view, measure the loss, step the optimiser, control the density; repeat
+//! (3DGS sections 5 and 7.1).
+
+mod checkpoint;
+mod config;
+mod history;
+mod loss;
+pub(crate) mod views;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use burn::module::Module;
+use burn::optim::{GradientsParams, ModuleOptimizer};
+use burn::tensor::{Device, Tensor};
+use splat_model::density::{AdaptiveDensity, RunShape};
+use splat_model::ops::{OpError, SH_DEGREE_MAX};
+use splat_model::{
+    EditLog, Gaussians, InitError, project_gaussians, render_projected, scene_scale,
+    splat_optimizer, splats_from_points,
+};
+
+use crate::capture::{Capture, CaptureError, View};
+use crate::evaluate::evaluate;
+
+pub use checkpoint::{Checkpoint, CheckpointError};
+pub use config::TrainConfig;
+pub use history::{History, LossRecord};
+pub use loss::{IntoLoss, LossTerms, TargetView};
+pub use views::{camera, photo};
+
+/// Why a run could not go on.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainError {
+    /// The capture has nothing to train on.
+    #[error(transparent)]
+    Capture(#[from] CaptureError),
+    /// The points cannot start a scene.
+    #[error("{capture}: {source}")]
+    Init {
+        /// The capture's folder.
+        capture: PathBuf,
+        /// What is wrong with them.
+        source: InitError,
+    },
+    /// A setting is out of range.
+    #[error("configuration: {0}")]
+    Config(String),
+    /// The checkpoint to resume from is not usable.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// An op refused its input.
+    #[error(transparent)]
+    Op(#[from] OpError),
+    /// The loss has no term, or does not depend on what was rendered.
+    #[error("the loss {0}")]
+    Loss(&'static str),
+    /// The loss is NaN or infinite.
+    #[error(
+        "step {step}: the loss is {value} on view {view}; lower the learning rates, or look at that photo and its camera"
+    )]
+    NotFinite {
+        /// The step, from 1.
+        step: usize,
+        /// Name of the photo.
+        view: String,
+        /// The loss.
+        value: f32,
+    },
+}
+
+/// Where a run stands, for whoever shows it.
+#[derive(Debug, Clone, Copy)]
+pub struct Progress<'a> {
+    /// Steps done.
+    pub step: usize,
+    /// Steps of the whole run.
+    pub steps: usize,
+    /// Number of Gaussians.
+    pub gaussians: usize,
+    /// What was logged so far; losses lag behind by up to [`LOSS_BATCH`] steps.
+    pub history: &'a History,
+}
+
+/// Losses are read back from the device in batches of this many steps.
+pub const LOSS_BATCH: usize = 10;
+
+/// What a run leaves.
+#[derive(Debug)]
+pub struct Trained {
+    /// The model.
+    pub gaussians: Gaussians,
+    /// What was logged.
+    pub history: History,
+    /// Steps done; fewer than asked for when interrupted.
+    pub steps: usize,
+    /// Time spent in steps, over all sessions of the run.
+    pub elapsed: Duration,
+    /// The state to resume from.
+    pub checkpoint: Checkpoint,
+}
+
+/// Builds a [`Trainer`].
+pub struct TrainerBuilder {
+    capture: Option<Arc<Capture>>,
+    config: TrainConfig,
+    device: Device,
+    loss: Option<LossTerms>,
+    interrupt: Arc<AtomicBool>,
+    resume: Option<Checkpoint>,
+    evaluate_every: Option<usize>,
+    on_progress: Box<dyn FnMut(Progress)>,
+}
+
+impl TrainerBuilder {
+    /// The photos to train on.
+    pub fn capture(mut self, capture: impl Into<Arc<Capture>>) -> Self {
+        self.capture = Some(capture.into());
+        self
+    }
+
+    /// Settings; the defaults are those of gsplat.
+    pub fn config(mut self, config: TrainConfig) -> Self {
+        self.config = config;
+        self
+    }
+
+    /// Where to compute. Default: Burn's default device.
+    pub fn device(mut self, device: Device) -> Self {
+        self.device = device;
+        self
+    }
+
+    /// What to minimise: a closure `|view, rendered| -> Result<Tensor<1>, OpError>` or
+    /// [`LossTerms`]. Default: [`LossTerms::l1_ssim`].
+    pub fn loss(mut self, loss: impl IntoLoss) -> Self {
+        self.loss = Some(loss.into_loss());
+        self
+    }
+
+    /// The run ends after the step during which this becomes true.
+    pub fn interrupt(mut self, flag: Arc<AtomicBool>) -> Self {
+        self.interrupt = flag;
+        self
+    }
+
+    /// Goes on from a checkpoint instead of the capture's points.
+    pub fn resume(mut self, checkpoint: Checkpoint) -> Self {
+        self.resume = Some(checkpoint);
+        self
+    }
+
+    /// Measures held-out PSNR every so many steps, for the curves. Default: never.
+    pub fn evaluate_every(mut self, steps: usize) -> Self {
+        self.evaluate_every = Some(steps.max(1));
+        self
+    }
+
+    /// Called after every step.
+    pub fn on_progress(mut self, callback: impl FnMut(Progress) + 'static) -> Self {
+        self.on_progress = Box::new(callback);
+        self
+    }
+
+    /// Checks everything and makes the first Gaussians.
+    ///
+    /// # Errors
+    /// When there is no capture, nothing in it to train on, or a setting is out of range.
+    pub fn build(self) -> Result<Trainer, TrainError> {
+        if let Some(problem) = self.config.problem() {
+            return Err(TrainError::Config(problem));
+        }
+        let capture = self
+            .capture
+            .ok_or_else(|| TrainError::Config("no capture was given".into()))?;
+        capture.check_trainable()?;
+        let loss = self
+            .loss
+            .unwrap_or_else(|| LossTerms::l1_ssim(self.config.ssim_weight));
+        let cameras: Vec<_> = capture.views.iter().map(camera).collect();
+        let run = RunShape {
+            steps: self.config.steps,
+            scene_scale: scene_scale(&cameras),
+            seed: self.config.seed,
+        };
+        let device = self.device.without_autodiff().autodiff();
+        let mut state = State::new(&self.config, run, &loss);
+        let gaussians = match self.resume {
+            Some(checkpoint) => checkpoint.restore(&mut state, &device)?,
+            None => first_gaussians(&capture, &self.config, run, &device)?,
+        };
+        if state.history.counts.is_empty() {
+            state.history.counts.push((0, gaussians.len()));
+        }
+        Ok(Trainer {
+            views: views::ViewOrder::new(self.config.seed, capture.split.train.len()),
+            capture,
+            config: self.config,
+            device,
+            loss,
+            run,
+            interrupt: self.interrupt,
+            evaluate_every: self.evaluate_every,
+            on_progress: self.on_progress,
+            gaussians,
+            state,
+            unread: Vec::new(),
+        })
+    }
+}
+
+fn first_gaussians(
+    capture: &Capture,
+    config: &TrainConfig,
+    run: RunShape,
+    device: &Device,
+) -> Result<Gaussians, TrainError> {
+    let points = &capture.points;
+    let positions: Vec<_> = points.iter().map(|p| p.position.map(|x| x as f32)).collect();
+    let colors: Vec<_> = points.iter().map(|p| p.color).collect();
+    let splats = splats_from_points(&positions, &colors, run.scene_scale, &config.init);
+    let splats = splats.map_err(|source| TrainError::Init {
+        capture: capture.root.clone(),
+        source,
+    })?;
+    Ok(Gaussians::from_data(&splats, device))
+}
+
+/// What changes during a run, apart from the Gaussians themselves.
+struct State {
+    optimizer: ModuleOptimizer,
+    edits: [EditLog; 6],
+    density: AdaptiveDensity,
+    history: History,
+    /// Steps done.
+    step: usize,
+    elapsed: Duration,
+}
+
+impl State {
+    fn new(config: &TrainConfig, run: RunShape, loss: &LossTerms) -> Self {
+        let (optimizer, edits) = splat_optimizer();
+        Self {
+            optimizer,
+            edits,
+            density: AdaptiveDensity::new(config.density.clone(), run),
+            history: History {
+                terms: loss.names().map(str::to_owned).collect(),
+                ..History::default()
+            },
+            step: 0,
+            elapsed: Duration::ZERO,
+        }
+    }
+}
+
+/// A loss that is still on the device.
+struct UnreadLoss {
+    step: usize,
+    view: usize,
+    /// Total, then the terms.
+    values: Vec<Tensor<1>>,
+}
+
+/// A training run.
+pub struct Trainer {
+    capture: Arc<Capture>,
+    config: TrainConfig,
+    device: Device,
+    loss: LossTerms,
+    run: RunShape,
+    views: views::ViewOrder,
+    interrupt: Arc<AtomicBool>,
+    evaluate_every: Option<usize>,
+    on_progress: Box<dyn FnMut(Progress)>,
+    gaussians: Gaussians,
+    state: State,
+    unread: Vec<UnreadLoss>,
+}
+
+impl Trainer {
+    /// Begins to describe a run.
+    pub fn builder() -> TrainerBuilder {
+        TrainerBuilder {
+            capture: None,
+            config: TrainConfig::default(),
+            device: Device::default(),
+            loss: None,
+            interrupt: Arc::default(),
+            resume: None,
+            evaluate_every: None,
+            on_progress: Box::new(|_| {}),
+        }
+    }
+
+    /// Runs to the last step, or until interrupted.
+    ///
+    /// # Errors
+    /// When the loss stops being a number, or an op refuses what it is given.
+    pub fn run(mut self) -> Result<Trained, TrainError> {
+        while self.state.step < self.config.steps && !self.should_stop() {
+            let start = Instant::now();
+            self.step()?;
+            let last = self.state.step == self.config.steps;
+            if self.unread.len() >= LOSS_BATCH || last {
+                self.read_losses()?;
+            }
+            self.state.elapsed += start.elapsed();
+            if self
+                .evaluate_every
+                .is_some_and(|every| last || self.state.step.is_multiple_of(every))
+            {
+                self.measure_held_out()?;
+            }
+            (self.on_progress)(Progress {
+                step: self.state.step,
+                steps: self.config.steps,
+                gaussians: self.gaussians.len(),
+                history: &self.state.history,
+            });
+        }
+        self.read_losses()?;
+        Ok(Trained {
+            checkpoint: Checkpoint::of(&self.gaussians, &self.state)?,
+            gaussians: self.gaussians.valid(),
+            history: self.state.history,
+            steps: self.state.step,
+            elapsed: self.state.elapsed,
+        })
+    }
+
+    /// Interrupted, and at a point that a checkpoint can hold: the means' moments, which are stepped
+    /// with all others, have followed every edit.
+    fn should_stop(&self) -> bool {
+        self.interrupt.load(Ordering::Relaxed) && !self.state.edits[0].is_pending()
+    }
+
+    fn step(&mut self) -> Result<(), TrainError> {
+        let step = self.state.step;
+        let index = self.capture.split.train[self.views.at(step)];
+        let view = &self.capture.views[index];
+        let cameras = camera(view).tensors(&self.device);
+        let settings = self.config.render_settings(self.sh_degree(step));
+
+        let mut projected = project_gaussians(&self.gaussians, &cameras, &settings)?;
+        let extents = projected.extents();
+        let probe = self.state.density.observes(step).then(|| {
+            let shape = [1, self.gaussians.len(), 2];
+            Tensor::<3>::zeros(shape, &self.device).require_grad()
+        });
+        if let Some(probe) = &probe {
+            projected = projected.with_screen_probe(probe.clone())?;
+        }
+        let rendered = render_projected(&self.gaussians, &projected, &cameras, &settings)?;
+        let target = TargetView {
+            name: &view.name,
+            image: photo(view, &self.device),
+            camera: &cameras,
+            step,
+        };
+        let Some((loss, terms)) = self.loss.evaluate(&target, &rendered)? else {
+            return Err(TrainError::Loss("has no term"));
+        };
+        if !loss.is_tracked() {
+            return Err(TrainError::Loss("does not depend on the rendered image"));
+        }
+        let mut grads = loss.backward();
+        let screen_gradient = probe.and_then(|probe| probe.grad_remove(&mut grads));
+        let grads = GradientsParams::from_grads(grads, &self.gaussians);
+        let rates = self
+            .config
+            .rates
+            .at(step, self.config.steps, self.run.scene_scale);
+        let gaussians = self.gaussians.clone();
+        self.gaussians = self.state.optimizer.step(rates, gaussians, grads);
+
+        let mut values = vec![loss.inner()];
+        values.extend(terms);
+        self.unread.push(UnreadLoss {
+            step: step + 1,
+            view: index,
+            values,
+        });
+        self.state.step += 1;
+        if let Some(gradient) = screen_gradient {
+            self.state.density.observe(gradient, extents, cameras.size);
+        }
+        // What would be added after the last step would never be trained.
+        if self.state.step < self.config.steps {
+            self.control_density();
+        }
+        Ok(())
+    }
+
+    fn control_density(&mut self) {
+        let gaussians = self.gaussians.clone();
+        let State {
+            density,
+            edits,
+            history,
+            step,
+            ..
+        } = &mut self.state;
+        let (gaussians, refinement) = density.refine(*step, gaussians, edits);
+        self.gaussians = gaussians;
+        if refinement.is_some() {
+            history.counts.push((*step, self.gaussians.len()));
+        }
+    }
+
+    fn sh_degree(&self, step: usize) -> usize {
+        (step / self.run.milestone(self.config.sh_degree_every)).min(SH_DEGREE_MAX)
+    }
+
+    /// Reads all pending losses in one transfer.
+    fn read_losses(&mut self) -> Result<(), TrainError> {
+        let unread = core::mem::take(&mut self.unread);
+        if unread.is_empty() {
+            return Ok(());
+        }
+        let tensors = unread.iter().flat_map(|loss| loss.values.clone()).collect();
+        let values = Tensor::cat(tensors, 0).into_data().convert::<f32>();
+        let values = values.into_vec::<f32>().unwrap_or_default();
+        for (loss, values) in unread.iter().zip(values.chunks(1 + self.state.history.terms.len())) {
+            if !values[0].is_finite() {
+                return Err(TrainError::NotFinite {
+                    step: loss.step,
+                    view: self.capture.views[loss.view].name.clone(),
+                    value: values[0],
+                });
+            }
+            self.state.history.losses.push(LossRecord {
+                step: loss.step,
+                total: values[0],
+                terms: values[1..].to_vec(),
+            });
+        }
+        Ok(())
+    }
+
+    fn measure_held_out(&mut self) -> Result<(), TrainError> {
+        let held_out: Vec<&View> = self.capture.test_views().collect();
+        if held_out.is_empty() {
+            return Ok(());
+        }
+        let settings = self.config.render_settings(SH_DEGREE_MAX);
+        let device = self.device.clone().without_autodiff();
+        let scores = evaluate(&self.gaussians.valid(), &held_out, &settings, &device, |_, _| {})?;
+        self.state
+            .history
+            .held_out_psnr
+            .push((self.state.step, scores.psnr));
+        Ok(())
+    }
+}

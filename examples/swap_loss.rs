@@ -1,0 +1,56 @@
+//! Swaps the loss: Charbonnier plus the edges' differences instead of L1 + D-SSIM.
+//!
+//! `cargo run --release --example swap_loss [CAPTURE [STEPS]]`
+
+use std::path::PathBuf;
+
+use burn::tensor::{Device, Tensor};
+use burn_splat::train::capture::{Capture, CaptureOptions};
+use burn_splat::train::evaluate;
+use burn_splat::train::train::{LossTerms, TrainConfig, Trainer};
+
+/// `mean sqrt(difference^2 + eps^2)`: L1 with a round bottom.
+fn charbonnier(difference: Tensor<4>) -> Tensor<1> {
+    (difference.square() + 1e-6).sqrt().mean()
+}
+
+/// Differences of neighbouring pixels along an axis of `[B, H, W, D]`.
+fn edges(image: Tensor<4>, axis: usize) -> Tensor<4> {
+    let length = image.dims()[axis] - 1;
+    image.clone().narrow(axis, 1, length) - image.narrow(axis, 0, length)
+}
+
+fn main() -> Result<(), Box<dyn std::error::Error>> {
+    let mut arguments = std::env::args().skip(1);
+    let folder = arguments.next().unwrap_or("examples/data/saharov".into());
+    let steps = arguments.next().map_or(Ok(300), |steps| steps.parse())?;
+    let capture = Capture::load(&PathBuf::from(folder), &CaptureOptions { downscale: 2 })?;
+    let device = Device::flex();
+
+    let loss = LossTerms::new()
+        .term("charbonnier", 0.8, |view, rendered| {
+            Ok(charbonnier(rendered.image() - view.image.clone()))
+        })
+        .term("edges", 0.2, |view, rendered| {
+            let difference = |axis| edges(rendered.image(), axis) - edges(view.image.clone(), axis);
+            Ok(charbonnier(difference(1)) + charbonnier(difference(2)))
+        });
+    let config = TrainConfig { steps, ..TrainConfig::default() };
+    let trained = Trainer::builder()
+        .capture(capture.clone())
+        .config(config.clone())
+        .device(device.clone())
+        .loss(loss)
+        .on_progress(|p| match p.history.losses.last() {
+            Some(l) if p.step.is_multiple_of(50) => println!("step {:5}  {:?} {:?}", p.step, p.history.terms, l.terms),
+            _ => {}
+        })
+        .build()?
+        .run()?;
+
+    let held_out: Vec<_> = capture.test_views().collect();
+    let settings = config.render_settings(3);
+    let scores = evaluate(&trained.gaussians, &held_out, &settings, &device, |_, _| {})?;
+    println!("held out: {:.2} dB PSNR, {:.4} SSIM, {} Gaussians", scores.psnr, scores.ssim, trained.gaussians.len());
+    Ok(())
+}
