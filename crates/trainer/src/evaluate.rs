@@ -1,6 +1,7 @@
 //! Scores of a model on views it was not trained on.
 
 use burn::tensor::{Device, Tensor};
+use serde::Serialize;
 use splat_model::losses::{SsimSettings, psnr, ssim};
 use splat_model::ops::OpError;
 use splat_model::{Gaussians, RenderSettings, render};
@@ -9,7 +10,7 @@ use crate::capture::View;
 use crate::train::{camera, photo};
 
 /// Scores of one view.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ViewScore {
     /// Name of the photo.
     pub name: String,
@@ -20,7 +21,7 @@ pub struct ViewScore {
 }
 
 /// Scores of several views and their means.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Scores {
     /// Mean of the views' PSNR in dB.
     pub psnr: f64,
@@ -56,12 +57,19 @@ pub fn evaluate(
         let picture = image.into_data().convert::<f32>();
         each(view, picture.into_vec().unwrap_or_default());
     }
-    let mean = |score: fn(&ViewScore) -> f64| {
-        scores.iter().map(score).sum::<f64>() / scores.len().max(1) as f64
-    };
-    Ok(Scores {
-        psnr: mean(|score| score.psnr),
-        ssim: mean(|score| score.ssim),
-        views: scores,
-    })
+    Ok(Scores::of_views(scores))
+}
+
+impl Scores {
+    /// The views with their means; NaN where there is no view.
+    pub fn of_views(views: Vec<ViewScore>) -> Self {
+        let mean = |score: fn(&ViewScore) -> f64| {
+            views.iter().map(score).sum::<f64>() / views.len() as f64
+        };
+        Self {
+            psnr: mean(|score| score.psnr),
+            ssim: mean(|score| score.ssim),
+            views,
+        }
+    }
 }

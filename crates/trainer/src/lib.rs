@@ -1,7 +1,10 @@
 //! Captures, the training loop, evaluation, reports, and the `splat` program.
 
 pub mod capture;
+pub mod cli;
 mod evaluate;
+pub mod gradcheck;
+pub mod report;
 pub mod train;
 
 pub use evaluate::{Scores, ViewScore, evaluate};

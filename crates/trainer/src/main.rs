@@ -1,1 +1,7 @@
-fn main() {}
+//! The `splat` program; see `splat --help`.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    splat_trainer::cli::main()
+}

@@ -1,0 +1,117 @@
+//! `--device`: which of Burn's devices to compute on.
+
+use burn::tensor::Device;
+use clap::ValueEnum;
+
+use super::{Failure, GlobalArgs};
+
+/// What `--device` takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub enum DeviceChoice {
+    /// A real GPU if there is one, else the CPU
+    #[default]
+    Auto,
+    /// The CPU
+    Cpu,
+    /// Vulkan, Metal, DirectX or WebGPU, software adapters included
+    Wgpu,
+    /// CUDA
+    Cuda,
+}
+
+/// A device and its name, for the user and for `metrics.json`.
+pub(super) struct ChosenDevice {
+    pub device: Device,
+    pub name: String,
+}
+
+/// Opens the device the user chose and says in a line which it is.
+pub(super) fn open(global: &GlobalArgs) -> Result<ChosenDevice, Failure> {
+    let chosen = match global.device {
+        DeviceChoice::Cpu => cpu(),
+        DeviceChoice::Wgpu => wgpu(),
+        DeviceChoice::Cuda => cuda(),
+        DeviceChoice::Auto => cuda()
+            .or_else(|_| real_gpu().ok_or(()))
+            .or_else(|()| cpu().or_else(|_| wgpu())),
+    }?;
+    global.say(format_args!("device: {}", chosen.name));
+    Ok(chosen)
+}
+
+#[cfg(feature = "cpu")]
+fn cpu() -> Result<ChosenDevice, Failure> {
+    Ok(ChosenDevice {
+        device: Device::flex(),
+        name: "cpu".to_owned(),
+    })
+}
+
+#[cfg(not(feature = "cpu"))]
+fn cpu() -> Result<ChosenDevice, Failure> {
+    Err(not_built("cpu"))
+}
+
+/// The first adapter that is a GPU. Software adapters (lavapipe, llvmpipe, WARP) call themselves a CPU and are left
+/// out: our own CPU path is many times faster.
+#[cfg(feature = "wgpu")]
+fn real_gpu() -> Option<ChosenDevice> {
+    use burn::tensor::DeviceKind;
+    let kinds = [
+        DeviceKind::DiscreteGpu(0),
+        DeviceKind::IntegratedGpu(0),
+        DeviceKind::VirtualGpu(0),
+    ];
+    kinds.into_iter().find_map(|kind| {
+        let device = Device::wgpu_options().device_kind(kind).init().ok()?;
+        Some(named("wgpu", device))
+    })
+}
+
+#[cfg(not(feature = "wgpu"))]
+fn real_gpu() -> Option<ChosenDevice> {
+    None
+}
+
+#[cfg(feature = "wgpu")]
+fn wgpu() -> Result<ChosenDevice, Failure> {
+    let device = Device::wgpu_options().init();
+    let device = device.map_err(|error| {
+        Failure::BadInput(format!("--device wgpu: no adapter can be used: {error}"))
+    })?;
+    Ok(named("wgpu", device))
+}
+
+#[cfg(not(feature = "wgpu"))]
+fn wgpu() -> Result<ChosenDevice, Failure> {
+    Err(not_built("wgpu"))
+}
+
+#[cfg(feature = "cuda")]
+fn cuda() -> Result<ChosenDevice, Failure> {
+    use burn::tensor::DeviceType;
+    let device = Device::enumerate(DeviceType::Cuda).into_iter().next();
+    let none = || Failure::BadInput("--device cuda: no CUDA device was found".to_owned());
+    Ok(named("cuda", device.ok_or_else(none)?))
+}
+
+#[cfg(not(feature = "cuda"))]
+fn cuda() -> Result<ChosenDevice, Failure> {
+    Err(not_built("cuda"))
+}
+
+#[cfg(any(feature = "wgpu", feature = "cuda"))]
+fn named(api: &str, device: Device) -> ChosenDevice {
+    let name = match device.identity() {
+        Some(identity) => format!("{api} ({})", identity.name),
+        None => api.to_owned(),
+    };
+    ChosenDevice { device, name }
+}
+
+#[cfg(not(all(feature = "cpu", feature = "wgpu", feature = "cuda")))]
+fn not_built(feature: &str) -> Failure {
+    Failure::BadInput(format!(
+        "--device {feature}: this program was built without it; build with `--features {feature}`"
+    ))
+}

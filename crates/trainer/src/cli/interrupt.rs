@@ -1,0 +1,19 @@
+//! Ctrl-C: the first finishes what is in hand, the second ends the program at once.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+/// Exit status of a program ended by Ctrl-C, by the convention of shells.
+const INTERRUPTED: i32 = 130;
+
+/// A flag that the first Ctrl-C sets.
+pub(super) fn flag() -> Result<Arc<AtomicBool>, ctrlc::Error> {
+    let flag = Arc::new(AtomicBool::new(false));
+    let seen = Arc::clone(&flag);
+    ctrlc::set_handler(move || {
+        if seen.swap(true, Ordering::Relaxed) {
+            std::process::exit(INTERRUPTED);
+        }
+    })?;
+    Ok(flag)
+}

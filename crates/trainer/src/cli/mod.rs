@@ -1,0 +1,97 @@
+//! The `splat` program: arguments, what is printed, exit status. One file per command.
+
+mod device;
+mod eval;
+mod failure;
+mod gradcheck;
+mod info;
+mod interrupt;
+mod render;
+mod scene;
+mod train;
+
+use std::io::Write;
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+
+pub use device::DeviceChoice;
+pub use failure::Failure;
+pub use gradcheck::GradcheckArgs;
+
+/// Train, render and inspect Gaussian splats.
+#[derive(Debug, Parser)]
+#[command(name = "splat", version, about, long_about = None)]
+#[command(after_help = "Exit status: 0 done, 1 a check failed, 2 bad input.")]
+struct Cli {
+    #[command(flatten)]
+    global: GlobalArgs,
+    #[command(subcommand)]
+    command: Command,
+}
+
+/// Arguments of every command.
+#[derive(Debug, Args)]
+pub struct GlobalArgs {
+    /// Where to compute; auto: a real GPU if there is one, else the CPU
+    #[arg(long, global = true, value_enum, default_value_t)]
+    pub device: DeviceChoice,
+    /// Seed of every random draw [default: 0]
+    #[arg(long, global = true)]
+    pub seed: Option<u64>,
+    /// Print results and errors only
+    #[arg(long, global = true)]
+    pub quiet: bool,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Train(train::TrainArgs),
+    Eval(eval::EvalArgs),
+    Render(render::RenderArgs),
+    Info(info::InfoArgs),
+}
+
+/// Runs the program on the process's arguments.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    let global = &cli.global;
+    let outcome = match &cli.command {
+        Command::Train(args) => train::run(args, global),
+        Command::Eval(args) => eval::run(args, global),
+        Command::Render(args) => render::run(args, global),
+        Command::Info(args) => info::run(args, global),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(failure) => {
+            eprintln!("{failure}");
+            failure.exit_code()
+        }
+    }
+}
+
+impl GlobalArgs {
+    /// Tells the user something that is no result.
+    fn say(&self, line: impl std::fmt::Display) {
+        if !self.quiet {
+            eprintln!("{line}");
+        }
+    }
+}
+
+/// Prints results. That nobody reads them (a closed pipe) is no error.
+fn print(text: &str) {
+    let mut out = std::io::stdout().lock();
+    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::CommandFactory;
+
+    #[test]
+    fn the_arguments_are_consistent() {
+        super::Cli::command().debug_assert();
+    }
+}

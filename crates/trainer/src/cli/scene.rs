@@ -1,0 +1,45 @@
+//! A scene file on a device, and how to render it.
+
+use std::path::Path;
+
+use burn::tensor::Device;
+use splat_model::files::ply;
+use splat_model::ops::SH_DEGREE_MAX;
+use splat_model::{Gaussians, RenderSettings};
+
+use super::{Failure, GlobalArgs};
+use crate::train::TrainConfig;
+
+/// Reads a scene. Scene files do not say whether they were trained with anti-aliasing or in front of a background;
+/// where the run's `config.toml` lies beside the file, it does.
+pub(super) fn open(
+    path: &Path,
+    device: &Device,
+    global: &GlobalArgs,
+) -> Result<(Gaussians, RenderSettings), Failure> {
+    let data = ply::read(path)?;
+    let mut settings = RenderSettings {
+        sh_degree: SH_DEGREE_MAX,
+        ..RenderSettings::default()
+    };
+    let config = path.with_file_name("config.toml");
+    if config.is_file() {
+        let config: TrainConfig = read_config(&config)?;
+        settings = config.render_settings(SH_DEGREE_MAX);
+        if config.antialias || config.background.is_some() {
+            global.say("rendering as the config.toml beside the scene says");
+        }
+    }
+    Ok((Gaussians::from_data(&data, device), settings))
+}
+
+/// Reads a run's settings.
+pub(super) fn read_config(path: &Path) -> Result<TrainConfig, Failure> {
+    let named = |reason: &dyn std::fmt::Display| {
+        let reason = reason.to_string();
+        let words: Vec<_> = reason.split_whitespace().collect();
+        Failure::BadInput(format!("{}: {}", path.display(), words.join(" ")))
+    };
+    let text = std::fs::read_to_string(path).map_err(|error| named(&error))?;
+    toml::from_str(&text).map_err(|error| named(&error))
+}

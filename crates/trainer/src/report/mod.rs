@@ -1,0 +1,43 @@
+//! What a run leaves behind and shows: pictures, curves, figures, progress.
+//!
+//! Everything is written by [`write_atomically`]: beside its place first, then renamed, so that an interrupted run
+//! leaves either the old file or the new one.
+
+mod atomic;
+pub mod curves;
+pub mod memory;
+pub mod metrics;
+pub mod png;
+pub mod progress;
+
+use std::path::PathBuf;
+
+pub use atomic::write_atomically;
+
+/// Why a report could not be written. Every message is one line that names the file.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ReportError {
+    /// The file could not be written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The contents could not be encoded.
+    #[error("{}: {reason}", path.display())]
+    Encode {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// A picture whose values do not fill its size, or two of different height side by side.
+    #[error("picture: {reason}")]
+    Shape {
+        /// What does not fit.
+        reason: String,
+    },
+}
