@@ -7,7 +7,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use burn::optim::{LearningRate, Optimizer, RecordState};
+use burn::optim::{LearningRate, Optimizer, RecordState, StateSink, StateSource};
 use burn::tensor::{Device, Int, Tensor};
 
 /// What happened to the rows of a parameter.
@@ -107,7 +107,7 @@ impl SplatAdam {
 }
 
 /// Moments of one parameter.
-#[derive(Debug, Clone, RecordState)]
+#[derive(Debug, Clone)]
 pub struct SplatAdamState<const D: usize> {
     /// Steps taken.
     pub time: usize,
@@ -132,6 +132,25 @@ impl<const D: usize> SplatAdamState<D> {
         self.moment_1 = follow(self.moment_1.clone());
         self.moment_2 = follow(self.moment_2.clone());
         self.edits_seen += 1;
+    }
+}
+
+// By hand: the derive names crates that only Burn itself depends on.
+impl<const D: usize> RecordState for SplatAdamState<D> {
+    fn state_flatten(&self, prefix: &str, out: &mut StateSink) {
+        out.push_scalar(prefix, "time", self.time.into());
+        out.push_scalar(prefix, "edits_seen", self.edits_seen.into());
+        out.push_tensor(prefix, "moment_1", self.moment_1.to_data());
+        out.push_tensor(prefix, "moment_2", self.moment_2.to_data());
+    }
+
+    fn state_unflatten(prefix: &str, src: &mut StateSource, device: &Device) -> Option<Self> {
+        Some(Self {
+            time: usize::try_from(src.take_scalar(prefix, "time")?).ok()?,
+            edits_seen: usize::try_from(src.take_scalar(prefix, "edits_seen")?).ok()?,
+            moment_1: Tensor::from_data(src.take_tensor(prefix, "moment_1")?, device),
+            moment_2: Tensor::from_data(src.take_tensor(prefix, "moment_2")?, device),
+        })
     }
 }
 

@@ -1,6 +1,6 @@
 //! Adaptive density control of 3DGS (section 5.2), with the defaults of gsplat.
 
-use burn::tensor::{Tensor, linalg};
+use burn::tensor::Tensor;
 use glam::{Quat, Vec3};
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
@@ -128,7 +128,8 @@ impl AdaptiveDensity {
         let half = Tensor::<1>::from_floats(half, &screen_gradient.device()).reshape([1, 1, 2]);
         let seen = extents.inner().narrow(2, 0, 1).reshape([cameras, n]);
         let seen = seen.greater_scalar(0.0).float();
-        let length = linalg::l2_norm(screen_gradient * half, 2).reshape([cameras, n]) * seen.clone();
+        let length = (screen_gradient * half).square().sum_dim(2).sqrt();
+        let length = length.reshape([cameras, n]) * seen.clone();
         let sum = length.sum_dim(0).reshape([n]);
         let count = seen.sum_dim(0).reshape([n]);
         self.statistics = Some(match self.statistics.take() {
