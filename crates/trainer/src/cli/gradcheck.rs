@@ -1,8 +1,12 @@
-//! `splat gradcheck`: arguments. The command joins the others when its judge does.
+//! `splat gradcheck`: our gradients against those of PyTorch.
 
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
+
+use super::{Failure, GlobalArgs, device, print};
+use crate::gradcheck::{check_file, json, table};
+use crate::report::metrics::write_json;
 
 /// Check every gradient against fixtures written by PyTorch
 #[derive(Debug, Args)]
@@ -29,4 +33,30 @@ pub enum Precision {
     F32,
     /// 64-bit float, on the CPU only
     F64,
+}
+
+/// Runs the command.
+pub(super) fn run(args: &GradcheckArgs, global: &GlobalArgs) -> Result<(), Failure> {
+    let chosen = device::open(global)?;
+    let precision = match args.precision {
+        Precision::F32 => crate::gradcheck::Precision::F32,
+        Precision::F64 => crate::gradcheck::Precision::F64,
+    };
+    let mut reports = Vec::with_capacity(args.files.len());
+    for file in &args.files {
+        let report = check_file(file, &chosen.device, precision)?;
+        print(&table(std::slice::from_ref(&report)));
+        reports.push(report);
+    }
+    if let Some(path) = &args.json {
+        write_json(path, &json(&reports))?;
+    }
+    let failed = reports.iter().filter(|report| !report.pass).count();
+    match failed {
+        0 => Ok(()),
+        _ => Err(Failure::Check(format!(
+            "{failed} of {} files are outside their gates",
+            reports.len()
+        ))),
+    }
 }
