@@ -1,0 +1,20 @@
+//! CubeCL kernels for Gaussian splatting, and nothing else: no tensor library.
+//!
+//! One file per stage, the forward pass beside its vector-Jacobian product, in the order of the data's way:
+//! [`project`] and [`sh`] (spherical harmonics) turn Gaussians into screen splats and their colours; [`intersect`]
+//! lists which tiles every splat touches, with [`scan`] and [`sort`]; [`rasterize`] blends each tile front to back;
+//! [`blur`] is the window of SSIM. Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous,
+//! row-major) and launch kernels without waiting, except where they say so. Sums never use float atomics: the same
+//! input gives the same bits on one device.
+
+pub mod blur;
+pub mod intersect;
+mod launch;
+mod math;
+pub mod project;
+pub mod rasterize;
+pub mod scan;
+pub mod sh;
+pub mod sort;
+
+pub use launch::{Buffer, CUBE_UNITS};

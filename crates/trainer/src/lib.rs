@@ -3,6 +3,7 @@
 pub mod capture;
 pub mod cli;
 mod evaluate;
+pub mod gradcheck;
 pub mod report;
 pub mod train;
 

@@ -31,7 +31,7 @@ const GEOMETRY: usize = 6;
 
 /// What the forward keeps for the backward.
 #[derive(Debug, Clone)]
-pub(super) struct State {
+pub struct State {
     /// Per camera.
     lists: Arc<Vec<TileLists>>,
     /// `[C, H, W]`: what is left of the light at each pixel. One minus alpha would lose its digits.

@@ -1,1 +1,142 @@
 //! Launches `splat-kernels` on CubeCL devices: CUDA, Vulkan, Metal, WebGPU.
+//!
+//! The kernels know buffers of f32 and sizes; here tensors become buffers and buffers tensors.
+
+mod blur;
+mod project;
+mod rasterize;
+mod spherical_harmonics;
+#[cfg(all(test, feature = "cpu", feature = "wgpu"))]
+mod tests;
+
+use burn::backend::TensorMetadata;
+use burn::tensor::{DType, Shape};
+use burn_cubecl::CubeBackend;
+use burn_cubecl::kernel::{cast, into_contiguous};
+use burn_cubecl::tensor::CubeTensor;
+use splat_kernels::Buffer;
+
+use crate::backend::SplatBackend;
+use crate::settings::{ProjectArgs, RasterizeArgs};
+
+/// A tensor of f32, contiguous.
+fn prepare(tensor: CubeTensor) -> CubeTensor {
+    let tensor = if tensor.dtype == DType::F32 {
+        tensor
+    } else {
+        cast(tensor, DType::F32)
+    };
+    into_contiguous(tensor)
+}
+
+/// The memory of a tensor that went through [`prepare`].
+fn buffer(tensor: &CubeTensor) -> Buffer {
+    let len = tensor.shape().num_elements();
+    // A contiguous tensor of f32 holds its elements. One that did not would be read as empty: every kernel checks
+    // bounds.
+    Buffer::new(tensor.handle.clone(), len).unwrap_or_else(|_| Buffer::empty(&tensor.client, 0))
+}
+
+/// A tensor of `shape` on the device of `like`, in the memory of `buffer`.
+fn tensor(like: &CubeTensor, buffer: Buffer, shape: Shape) -> CubeTensor {
+    CubeTensor::new_contiguous(
+        like.client.clone(),
+        like.device.clone(),
+        shape,
+        buffer.into_handle(),
+        DType::F32,
+    )
+}
+
+impl SplatBackend for CubeBackend {
+    type RasterizeState = splat_kernels::rasterize::RasterizeState;
+
+    fn project_forward(
+        means: CubeTensor,
+        quats: CubeTensor,
+        scales: CubeTensor,
+        viewmats: CubeTensor,
+        intrinsics: CubeTensor,
+        args: &ProjectArgs,
+    ) -> CubeTensor {
+        project::forward([means, quats, scales, viewmats, intrinsics], args)
+    }
+
+    fn project_backward(
+        means: CubeTensor,
+        quats: CubeTensor,
+        scales: CubeTensor,
+        viewmats: CubeTensor,
+        intrinsics: CubeTensor,
+        grad_packed: CubeTensor,
+        args: &ProjectArgs,
+        wanted: [bool; 5],
+    ) -> [Option<CubeTensor>; 5] {
+        project::backward(
+            [means, quats, scales, viewmats, intrinsics],
+            grad_packed,
+            args,
+            wanted,
+        )
+    }
+
+    fn spherical_harmonics_forward(
+        coeffs: CubeTensor,
+        dirs: CubeTensor,
+        degree: usize,
+    ) -> CubeTensor {
+        spherical_harmonics::forward(coeffs, dirs, degree)
+    }
+
+    fn spherical_harmonics_backward(
+        coeffs: CubeTensor,
+        dirs: CubeTensor,
+        grad: CubeTensor,
+        degree: usize,
+        wanted: [bool; 2],
+    ) -> [Option<CubeTensor>; 2] {
+        spherical_harmonics::backward(coeffs, dirs, grad, degree, wanted)
+    }
+
+    /// # Panics
+    /// Where the device fails, or more than 2^31 - 1 pairs of a splat and a tile would have to be listed.
+    fn rasterize_forward(
+        packed: CubeTensor,
+        colors: CubeTensor,
+        opacities: CubeTensor,
+        background: Option<CubeTensor>,
+        args: &RasterizeArgs,
+    ) -> (CubeTensor, Self::RasterizeState) {
+        match rasterize::forward(packed, colors, opacities, background, args) {
+            Ok(rendered) => rendered,
+            Err(error) => panic!("rasterize: {error}"),
+        }
+    }
+
+    fn rasterize_backward(
+        packed: CubeTensor,
+        colors: CubeTensor,
+        opacities: CubeTensor,
+        background: Option<CubeTensor>,
+        _output: CubeTensor,
+        state: Self::RasterizeState,
+        grad_output: CubeTensor,
+        args: &RasterizeArgs,
+        wanted: [bool; 4],
+    ) -> [Option<CubeTensor>; 4] {
+        rasterize::backward(
+            packed,
+            colors,
+            opacities,
+            background,
+            &state,
+            grad_output,
+            args,
+            wanted,
+        )
+    }
+
+    fn gaussian_blur(image: CubeTensor, window: &[f64]) -> CubeTensor {
+        blur::blur(image, window)
+    }
+}

@@ -1,0 +1,123 @@
+//! Rasterisation on CubeCL devices.
+
+use burn::backend::TensorMetadata;
+use burn::tensor::Shape;
+use burn_cubecl::tensor::CubeTensor;
+use splat_kernels::Buffer;
+use splat_kernels::intersect::{Frames, IntersectError};
+use splat_kernels::rasterize::{
+    RasterizeInputs, RasterizeSettings, RasterizeState, rasterize, rasterize_vjp,
+};
+
+use super::{buffer, prepare, tensor};
+use crate::settings::RasterizeArgs;
+
+fn settings(args: &RasterizeArgs) -> RasterizeSettings {
+    RasterizeSettings {
+        alpha_max: args.settings.alpha_max as f32,
+        transmittance_min: args.settings.transmittance_min as f32,
+    }
+}
+
+/// Sizes, from colours `[C, N, D]`.
+fn frames(colors: &CubeTensor, args: &RasterizeArgs) -> Frames {
+    let shape = colors.shape();
+    Frames {
+        cameras: shape[0],
+        gaussians: shape[1],
+        width: args.size.width,
+        height: args.size.height,
+        alpha_min: args.settings.alpha_min as f32,
+    }
+}
+
+/// Packed splats, colours, opacities and the background, ready for the kernels.
+struct Prepared {
+    packed: CubeTensor,
+    colors: CubeTensor,
+    opacities: CubeTensor,
+    background: Option<CubeTensor>,
+}
+
+impl Prepared {
+    fn new(
+        packed: CubeTensor,
+        colors: CubeTensor,
+        opacities: CubeTensor,
+        background: Option<CubeTensor>,
+    ) -> Self {
+        Self {
+            packed: prepare(packed),
+            colors: prepare(colors),
+            opacities: prepare(opacities),
+            background: background.map(prepare),
+        }
+    }
+
+    fn inputs(&self) -> RasterizeInputs {
+        RasterizeInputs {
+            packed: buffer(&self.packed),
+            colors: buffer(&self.colors),
+            opacities: buffer(&self.opacities),
+            background: self.background.as_ref().map(buffer),
+            channels: self.colors.shape()[2],
+        }
+    }
+}
+
+/// The image with alpha `[C, H, W, D + 1]`, and what the backward pass needs.
+pub(super) fn forward(
+    packed: CubeTensor,
+    colors: CubeTensor,
+    opacities: CubeTensor,
+    background: Option<CubeTensor>,
+    args: &RasterizeArgs,
+) -> Result<(CubeTensor, RasterizeState), IntersectError> {
+    let prepared = Prepared::new(packed, colors, opacities, background);
+    let inputs = prepared.inputs();
+    let frames = frames(&prepared.colors, args);
+    let (output, state) = rasterize(&prepared.packed.client, &inputs, &frames, &settings(args))?;
+    let shape = Shape::from([
+        frames.cameras,
+        frames.height as usize,
+        frames.width as usize,
+        inputs.channels + 1,
+    ]);
+    Ok((tensor(&prepared.packed, output, shape), state))
+}
+
+/// The wanted gradients of packed splats, colours, opacities and background.
+pub(super) fn backward(
+    packed: CubeTensor,
+    colors: CubeTensor,
+    opacities: CubeTensor,
+    background: Option<CubeTensor>,
+    state: &RasterizeState,
+    grad_output: CubeTensor,
+    args: &RasterizeArgs,
+    wanted: [bool; 4],
+) -> [Option<CubeTensor>; 4] {
+    let prepared = Prepared::new(packed, colors, opacities, background);
+    let grad_output = prepare(grad_output);
+    let [packed, colors, opacities, background] = rasterize_vjp(
+        &grad_output.client,
+        &prepared.inputs(),
+        state,
+        &buffer(&grad_output),
+        &frames(&prepared.colors, args),
+        &settings(args),
+        wanted,
+    );
+    let like = |grad: Option<Buffer>, input: &CubeTensor| {
+        grad.map(|grad| tensor(input, grad, input.shape()))
+    };
+    [
+        like(packed, &prepared.packed),
+        like(colors, &prepared.colors),
+        like(opacities, &prepared.opacities),
+        prepared
+            .background
+            .as_ref()
+            .and_then(|input| like(background, input)),
+    ]
+}

@@ -1,0 +1,201 @@
+//! The CubeCL kernels, through Burn and its autodiff, against the native path in f32.
+
+use burn::tensor::{Device, DeviceKind, Tensor, TensorData};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg32;
+
+use crate::{
+    ImageSize, ProjectSettings, RasterizeSettings, gaussian_blur, project, rasterize,
+    spherical_harmonics,
+};
+
+/// Whether there is a wgpu adapter, a software one included.
+fn has_adapter() -> bool {
+    use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
+    let found = [DefaultDevice, Cpu]
+        .into_iter()
+        .any(|kind| cubecl::Device::wgpu(kind).is_ok());
+    if !found {
+        eprintln!(
+            "\n*** SKIPPED: no wgpu adapter on this machine, the kernels were NOT tested ***\n"
+        );
+    }
+    found
+}
+
+struct Scene {
+    gaussians: usize,
+    size: ImageSize,
+    values: Vec<(&'static str, Vec<usize>, Vec<f32>)>,
+    weights: Vec<f32>,
+}
+
+impl Scene {
+    fn new(gaussians: usize, size: ImageSize, cameras: usize, scale: f32) -> Self {
+        let mut rng = Pcg32::seed_from_u64(7);
+        let mut uniform = |len: usize, low: f32, high: f32| -> Vec<f32> {
+            (0..len).map(|_| rng.random_range(low..high)).collect()
+        };
+        let n = gaussians;
+        let mut means = uniform(n * 3, -1.5, 1.5);
+        for z in means.iter_mut().skip(2).step_by(3) {
+            *z += 3.0;
+        }
+        let mut viewmats = Vec::new();
+        let mut intrinsics = Vec::new();
+        for c in 0..cameras {
+            let (s, k) = (0.1 * c as f32).sin_cos();
+            #[rustfmt::skip]
+            viewmats.extend([k, 0.0, s, 0.0,  0.0, 1.0, 0.0, 0.1,  -s, 0.0, k, 0.2,  0.0, 0.0, 0.0, 1.0]);
+            let focal = 0.9 * size.width as f32;
+            intrinsics.extend([
+                focal,
+                focal,
+                0.48 * size.width as f32,
+                0.52 * size.height as f32,
+            ]);
+        }
+        let pixels = (size.width * size.height) as usize;
+        Self {
+            gaussians,
+            size,
+            values: vec![
+                ("means", vec![n, 3], means),
+                ("quats", vec![n, 4], uniform(n * 4, -1.0, 1.0)),
+                ("scales", vec![n, 3], uniform(n * 3, 0.1 * scale, scale)),
+                ("viewmats", vec![cameras, 4, 4], viewmats),
+                ("intrinsics", vec![cameras, 4], intrinsics),
+                ("coeffs", vec![n, 16, 3], uniform(n * 48, -0.3, 0.3)),
+                ("opacities", vec![n], uniform(n, 0.05, 0.95)),
+                (
+                    "background",
+                    vec![cameras, 3],
+                    uniform(cameras * 3, 0.0, 1.0),
+                ),
+            ],
+            weights: uniform(cameras * pixels * 4, -1.0, 1.0),
+        }
+    }
+
+    /// The blurred image and the gradients of every input, named.
+    fn run(&self, device: &Device) -> Vec<(&'static str, Vec<f32>)> {
+        fn tensor<const D: usize>(scene: &Scene, which: usize, device: &Device) -> Tensor<D> {
+            let (_, shape, values) = &scene.values[which];
+            Tensor::from_data(TensorData::new(values.clone(), shape.clone()), device).require_grad()
+        }
+        let device = device.clone().autodiff();
+        let means = tensor::<2>(self, 0, &device);
+        let quats = tensor::<2>(self, 1, &device);
+        let scales = tensor::<2>(self, 2, &device);
+        let viewmats = tensor::<3>(self, 3, &device);
+        let intrinsics = tensor::<2>(self, 4, &device);
+        let coeffs = tensor::<3>(self, 5, &device);
+        let opacities = tensor::<1>(self, 6, &device);
+        let background = tensor::<2>(self, 7, &device);
+
+        let cameras = viewmats.dims()[0];
+        let projected = project(
+            means.clone(),
+            quats.clone(),
+            scales.clone(),
+            viewmats.clone(),
+            intrinsics.clone(),
+            self.size,
+            &ProjectSettings::default(),
+        )
+        .unwrap();
+        let dirs = means
+            .clone()
+            .unsqueeze::<3>()
+            .expand([cameras, self.gaussians, 3]);
+        let colors = spherical_harmonics(coeffs.clone(), dirs, 3).unwrap() + 0.5;
+        let rendered = rasterize(
+            &projected,
+            colors,
+            opacities.clone(),
+            Some(background.clone()),
+            &RasterizeSettings::default(),
+        )
+        .unwrap();
+        let image = gaussian_blur(rendered.packed(), &[0.1, 0.2, 0.4, 0.2, 0.1]).unwrap();
+        let weights = Tensor::from_data(
+            TensorData::new(self.weights.clone(), image.dims().to_vec()),
+            &device,
+        );
+        let grads = (image.clone() * weights).sum().backward();
+        let host = |data: TensorData| data.try_to_vec::<f32>().unwrap();
+        vec![
+            ("image", host(image.into_data())),
+            ("means", host(means.grad(&grads).unwrap().into_data())),
+            ("quats", host(quats.grad(&grads).unwrap().into_data())),
+            ("scales", host(scales.grad(&grads).unwrap().into_data())),
+            ("viewmats", host(viewmats.grad(&grads).unwrap().into_data())),
+            (
+                "intrinsics",
+                host(intrinsics.grad(&grads).unwrap().into_data()),
+            ),
+            ("coeffs", host(coeffs.grad(&grads).unwrap().into_data())),
+            (
+                "opacities",
+                host(opacities.grad(&grads).unwrap().into_data()),
+            ),
+            (
+                "background",
+                host(background.grad(&grads).unwrap().into_data()),
+            ),
+        ]
+    }
+}
+
+/// |a - b| / |b|
+fn relative_l2(a: &[f32], b: &[f32]) -> f64 {
+    let square = |v: f64| v * v;
+    let error: f64 = a.iter().zip(b).map(|(a, b)| square(f64::from(a - b))).sum();
+    let norm: f64 = b.iter().map(|b| square(f64::from(*b))).sum();
+    assert!(a.len() == b.len() && norm > 0.0);
+    (error / norm).sqrt()
+}
+
+#[test]
+fn kernels_agree_with_the_native_path_in_images_and_all_gradients() {
+    if !has_adapter() {
+        return;
+    }
+    let size = ImageSize {
+        width: 75,
+        height: 50,
+    };
+    let scene = Scene::new(400, size, 2, 0.15);
+    let native = scene.run(&Device::flex());
+    let kernels = scene.run(&Device::wgpu(DeviceKind::DefaultDevice));
+    for ((name, kernels), (_, native)) in kernels.iter().zip(&native) {
+        let error = relative_l2(kernels, native);
+        println!("{name}: relative L2 {error:.1e}");
+        // Both are f32: within the 1e-4 that each keeps to float64.
+        assert!(error <= 1e-4, "{name}: relative L2 {error:e}");
+    }
+}
+
+/// Prints times; run it by name with `--ignored --nocapture`.
+#[test]
+#[ignore = "a measurement, not a check"]
+fn time_of_a_step_at_270_by_480() {
+    if !has_adapter() {
+        return;
+    }
+    let size = ImageSize {
+        width: 270,
+        height: 480,
+    };
+    let scene = Scene::new(15_000, size, 1, 0.03);
+    for (name, device) in [
+        ("Flex", Device::flex()),
+        ("wgpu", Device::wgpu(DeviceKind::DefaultDevice)),
+    ] {
+        for round in 0..4 {
+            let start = std::time::Instant::now();
+            scene.run(&device);
+            println!("{name}, round {round}: {:?}", start.elapsed());
+        }
+    }
+}

@@ -1,0 +1,274 @@
+//! Renders a fixture with our ops and takes the gradients of its loss with Burn's autodiff.
+
+use burn::tensor::{DType, Device, Tensor, TensorData};
+use splat_ops::{Projected, project, rasterize, spherical_harmonics};
+
+use super::fixture::{Array, Fixture, Inputs, Outputs};
+use super::{GradcheckError, Precision};
+
+/// A known bug for negative controls. A suite that passes with one of them proves nothing.
+///
+/// Each is made by composing the ops wrongly; the ops themselves know nothing of it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Bug {
+    /// The direction of the spherical harmonics passes no gradient to the means and the camera.
+    DirectionDetached,
+    /// The backward of the projection takes the quaternion for one of length 1 that needs no
+    /// normalisation: no division by its length, and a part along the quaternion is left in.
+    QuaternionNormalisationSkipped,
+    /// Half of the gradient through the off-diagonal entry of the inverse covariance is lost.
+    OffDiagonalHalved,
+    /// The Jacobian of the projection is not clamped off-screen.
+    ClampIgnored,
+}
+
+impl Bug {
+    /// All of them.
+    pub const ALL: [Self; 4] = [
+        Self::DirectionDetached,
+        Self::QuaternionNormalisationSkipped,
+        Self::OffDiagonalHalved,
+        Self::ClampIgnored,
+    ];
+}
+
+/// What our ops make of a fixture.
+#[derive(Debug, Clone)]
+pub struct Computed {
+    /// Pictures, in the fixture's shapes.
+    pub outputs: Outputs,
+    /// Gradients of the fixture's loss, in the fixture's shapes.
+    pub gradients: Inputs,
+    /// Screen splats `[C, N, 9]`, as [`Projected::packed`] holds them.
+    pub projected: Array,
+    /// Opacities at the rasteriser `[C, N]`: compensated in anti-aliased mode.
+    pub opacities: Array,
+}
+
+/// Renders a fixture on a device and differentiates its loss.
+///
+/// # Errors
+/// When the device lacks the precision, the ops refuse the scene, or results cannot be read back.
+pub fn run(
+    fixture: &Fixture,
+    device: &Device,
+    precision: Precision,
+    bug: Option<Bug>,
+) -> Result<Computed, GradcheckError> {
+    let dtype = precision.dtype();
+    if !device.supports_dtype(dtype) {
+        return Err(GradcheckError::Device {
+            file: fixture.file.clone(),
+            reason: format!("{device:?} does not compute in {precision}"),
+        });
+    }
+    let upload = Upload {
+        device: device.clone().autodiff(),
+        dtype,
+    };
+    let (c, n) = (fixture.cameras, fixture.gaussians);
+    let (w, h) = (fixture.size.width as usize, fixture.size.height as usize);
+    let inputs = &fixture.inputs;
+
+    // Leaves, cameras in front.
+    let means = upload.leaf::<2>(&inputs.means, [n, 3]);
+    let quats = upload.leaf::<2>(&inputs.quats, [n, 4]);
+    let scales = upload.leaf::<2>(&inputs.scales, [n, 3]);
+    let opacities = upload.leaf::<1>(&inputs.opacities, [n]);
+    let sh_coeffs = upload.leaf::<3>(&inputs.sh_coeffs, [n, 16, 3]);
+    let viewmats = upload.leaf::<3>(&inputs.viewmat, [c, 4, 4]);
+    let intrinsics = upload.leaf::<2>(&inputs.intrinsics, [c, 4]);
+    let background = upload.leaf::<1>(&inputs.background, [3]);
+
+    // Screen splats.
+    let mut settings = fixture.project;
+    if bug == Some(Bug::ClampIgnored) {
+        settings.clamp_margin = 1e6;
+    }
+    let (shape_quats, shape_scales) = match bug {
+        Some(Bug::QuaternionNormalisationSkipped) => {
+            quaternion_normalisation_skipped(quats.clone(), scales.clone())
+        }
+        _ => (quats.clone(), scales.clone()),
+    };
+    let op = |source| GradcheckError::Op {
+        file: fixture.file.clone(),
+        source,
+    };
+    let mut projected = project(
+        means.clone(),
+        shape_quats,
+        shape_scales,
+        viewmats.clone(),
+        intrinsics.clone(),
+        fixture.size,
+        &settings,
+    )
+    .map_err(op)?;
+    if bug == Some(Bug::OffDiagonalHalved) {
+        projected = off_diagonal_halved(&projected).map_err(op)?;
+    }
+
+    // Colours, seen from the camera centre -W^T t.
+    let rotation = viewmats.clone().narrow(1, 0, 3).narrow(2, 0, 3); // [C, 3, 3]
+    let translation = viewmats.clone().narrow(1, 0, 3).narrow(2, 3, 1); // [C, 3, 1]
+    let centre = (rotation * translation).sum_dim(1).neg(); // [C, 1, 3]
+    let mut directions = means.clone().unsqueeze_dim::<3>(0) - centre; // [C, N, 3]
+    if bug == Some(Bug::DirectionDetached) {
+        directions = directions.detach();
+    }
+    let colors = spherical_harmonics(sh_coeffs.clone(), directions, fixture.sh_degree)
+        .map_err(op)?
+        .add_scalar(0.5)
+        .clamp_min(0.0);
+
+    // Depth is one more colour, over a background of zero.
+    let backdrop = background.clone().reshape([1, 3]).expand([c, 3]);
+    let (colors, backdrop) = match fixture.upstream.depth {
+        None => (colors, backdrop),
+        Some(_) => (
+            Tensor::cat(vec![colors, projected.depths().unsqueeze_dim::<3>(2)], 2),
+            Tensor::cat(
+                vec![backdrop, Tensor::zeros([c, 1], (&upload.device, dtype))],
+                1,
+            ),
+        ),
+    };
+    let mut blended = opacities.clone().reshape([1, n]).expand([c, n]);
+    if fixture.antialias {
+        blended = blended * projected.compensations();
+    }
+    let rendered = rasterize(
+        &projected,
+        colors,
+        blended.clone(),
+        Some(backdrop),
+        &fixture.rasterize,
+    )
+    .map_err(op)?;
+
+    // The loss of the fixture, and its gradients.
+    let image = rendered.image().narrow(3, 0, 3);
+    let alpha = rendered.alpha();
+    let depth = fixture
+        .upstream
+        .depth
+        .as_ref()
+        .map(|upstream| (rendered.image().narrow(3, 3, 1), upstream));
+    let weighted = |output: &Tensor<4>, upstream: &Array, channels| {
+        let upstream = upload.constant::<4>(upstream, [c, h, w, channels]);
+        (output.clone() * upstream).sum()
+    };
+    let mut loss =
+        weighted(&image, &fixture.upstream.image, 3) + weighted(&alpha, &fixture.upstream.alpha, 1);
+    if let Some((depth, upstream)) = &depth {
+        loss = loss + weighted(depth, upstream, 1);
+    }
+    let grads = loss.backward();
+
+    let download = Download { fixture };
+    let expected = &fixture.expected;
+    Ok(Computed {
+        outputs: Outputs {
+            image: download.tensor(image, &expected.image.shape)?,
+            alpha: download.tensor(alpha, &expected.alpha.shape)?,
+            depth: depth
+                .map(|(depth, _)| download.tensor(depth, &expected.alpha.shape))
+                .transpose()?,
+        },
+        gradients: Inputs {
+            means: download.gradient(means.grad(&grads), &inputs.means)?,
+            quats: download.gradient(quats.grad(&grads), &inputs.quats)?,
+            scales: download.gradient(scales.grad(&grads), &inputs.scales)?,
+            opacities: download.gradient(opacities.grad(&grads), &inputs.opacities)?,
+            sh_coeffs: download.gradient(sh_coeffs.grad(&grads), &inputs.sh_coeffs)?,
+            viewmat: download.gradient(viewmats.grad(&grads), &inputs.viewmat)?,
+            intrinsics: download.gradient(intrinsics.grad(&grads), &inputs.intrinsics)?,
+            background: download.gradient(background.grad(&grads), &inputs.background)?,
+        },
+        projected: download.tensor(projected.packed(), &[c, n, 9])?,
+        opacities: download.tensor(blended, &[c, n])?,
+    })
+}
+
+/// The same values, with the gradients of a backward that forgets to differentiate q / |q|.
+///
+/// The quaternion that reaches the op has the value q / |q| but passes its gradient to q unchanged.
+/// The unnormalised rotation matrix grows with the square of the quaternion's length, so the part
+/// along it is that of a scale of |q|^2.
+fn quaternion_normalisation_skipped(quats: Tensor<2>, scales: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
+    let length = quats.clone().square().sum_dim(1).sqrt();
+    let unit = (quats.clone() / length).detach();
+    let quats = unit + quats.clone() - quats.detach();
+    let square = quats.clone().square().sum_dim(1);
+    (quats, scales * square)
+}
+
+/// The same screen splats, with half the gradient into w21.
+fn off_diagonal_halved(projected: &Projected) -> Result<Projected, splat_ops::OpError> {
+    let packed = projected.packed();
+    let w21 = packed.clone().narrow(2, 4, 1);
+    let halved = w21.clone().mul_scalar(0.5) + w21.mul_scalar(0.5).detach();
+    Projected::from_packed(
+        Tensor::cat(
+            vec![
+                packed.clone().narrow(2, 0, 4),
+                halved,
+                packed.narrow(2, 5, 4),
+            ],
+            2,
+        ),
+        projected.image_size(),
+    )
+}
+
+struct Upload {
+    device: Device,
+    dtype: DType,
+}
+
+impl Upload {
+    fn constant<const D: usize>(&self, array: &Array, shape: [usize; D]) -> Tensor<D> {
+        let data = TensorData::new(array.values.clone(), shape);
+        Tensor::from_data(data, (&self.device, self.dtype))
+    }
+
+    fn leaf<const D: usize>(&self, array: &Array, shape: [usize; D]) -> Tensor<D> {
+        self.constant(array, shape).require_grad()
+    }
+}
+
+struct Download<'a> {
+    fixture: &'a Fixture,
+}
+
+impl Download<'_> {
+    fn tensor<const D: usize>(
+        &self,
+        tensor: Tensor<D>,
+        shape: &[usize],
+    ) -> Result<Array, GradcheckError> {
+        let values = tensor
+            .try_into_vec_as::<f64>()
+            .map_err(|error| GradcheckError::Device {
+                file: self.fixture.file.clone(),
+                reason: format!("results cannot be read back: {error}"),
+            })?;
+        Ok(Array {
+            shape: shape.to_vec(),
+            values,
+        })
+    }
+
+    /// No gradient at all is a gradient of zero; the judge decides whether that is right.
+    fn gradient<const D: usize>(
+        &self,
+        gradient: Option<Tensor<D>>,
+        like: &Array,
+    ) -> Result<Array, GradcheckError> {
+        match gradient {
+            Some(tensor) => self.tensor(tensor, &like.shape),
+            None => Ok(Array::zeros(&like.shape)),
+        }
+    }
+}

@@ -1,0 +1,422 @@
+//! Which splats touch which tiles, front to back (3DGS section 6).
+//!
+//! Splats are sorted by depth once (equal depths by index); each emits the tiles it touches in that order; a stable
+//! sort by tile then leaves the list of every tile in depth order. An *instance* is one (splat, tile) pair, its *slot*
+//! its place in the order of emission: the slots of one splat are consecutive, so that gradients that were written to
+//! slots can be summed splat by splat, in order.
+//!
+//! A splat touches a tile iff the ellipse `opacity exp(-sigma) >= alpha_min` meets the rectangle of the tile's pixel
+//! centres: sigma is convex, so unless its centre lies in the rectangle its minimum lies on an edge that faces it.
+
+use std::fmt;
+
+use cubecl::prelude::*;
+
+use crate::launch::{Buffer, per_element};
+use crate::math::is_finite;
+use crate::project::PACKED;
+use crate::scan::exclusive_sum_with_total;
+use crate::sort::{bits_for, iota, ordered_bits, sort_pairs};
+
+/// Side of a tile in pixels.
+pub const TILE: u32 = 16;
+
+/// The images that are rendered together.
+#[derive(Clone, Copy, Debug)]
+pub struct Frames {
+    /// C, number of cameras.
+    pub cameras: usize,
+    /// N, Gaussians per camera.
+    pub gaussians: usize,
+    /// Image width in pixels.
+    pub width: u32,
+    /// Image height in pixels.
+    pub height: u32,
+    /// Alpha below which a splat is not seen.
+    pub alpha_min: f32,
+}
+
+impl Frames {
+    /// Tiles of all images.
+    pub fn tiles(&self) -> usize {
+        self.cameras * self.width.div_ceil(TILE) as usize * self.height.div_ceil(TILE) as usize
+    }
+
+    /// Screen splats of all cameras.
+    pub fn splats(&self) -> usize {
+        self.cameras * self.gaussians
+    }
+
+    pub(crate) fn uniforms(&self) -> GridLaunch {
+        GridLaunch::new(
+            self.gaussians as u32,
+            self.splats() as u32,
+            self.tiles() as u32,
+            self.width,
+            self.height,
+            self.width.div_ceil(TILE),
+            self.height.div_ceil(TILE),
+            self.alpha_min,
+        )
+    }
+}
+
+/// [`Frames`] on the device.
+#[derive(CubeType, CubeLaunch, Clone, Copy)]
+#[expand(derive(Clone, Copy))]
+pub(crate) struct Grid {
+    pub gaussians: u32,
+    pub splats: u32,
+    /// Tiles of all cameras.
+    pub tiles: u32,
+    pub width: u32,
+    pub height: u32,
+    pub columns: u32,
+    pub rows: u32,
+    pub alpha_min: f32,
+}
+
+/// The lists of all tiles of all cameras.
+#[derive(Clone, Debug)]
+pub struct TileLists {
+    /// Number of instances.
+    pub instances: usize,
+    /// Splat (camera N + Gaussian) of every instance, by tile, front to back.
+    pub splats: Buffer,
+    /// Slot of every instance, in the same order.
+    pub slots: Buffer,
+    /// First instance and end of every tile [tiles, 2].
+    pub ranges: Buffer,
+    /// All splats, front to back.
+    pub order: Buffer,
+    /// `offsets[j]..offsets[j + 1]`: the slots of splat `order[j]` [splats + 1].
+    pub offsets: Buffer,
+}
+
+/// Why there are no tile lists.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum IntersectError {
+    /// More (splat, tile) pairs than can be indexed.
+    TooManyInstances(u64),
+    /// The device failed, in its words.
+    Device(String),
+}
+
+impl fmt::Display for IntersectError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::TooManyInstances(count) => write!(
+                f,
+                "{count} pairs of a splat and a tile that it touches; at most {MAX_INSTANCES} can be rendered at once"
+            ),
+            Self::Device(error) => write!(f, "the device failed: {error}"),
+        }
+    }
+}
+
+impl std::error::Error for IntersectError {}
+
+/// Instances that can be indexed.
+pub const MAX_INSTANCES: u64 = i32::MAX as u64;
+
+/// The part of a splat that can be seen: the ellipse sigma <= `cut`.
+#[derive(CubeType, Clone, Copy)]
+#[expand(derive(Clone, Copy))]
+struct Footprint {
+    seen: bool,
+    mean_x: f32,
+    mean_y: f32,
+    w11: f32,
+    w21: f32,
+    w22: f32,
+    /// ln(opacity / alpha_min), a little widened: rounding must never drop a pixel.
+    cut: f32,
+    /// Half size of the ellipse's bounding box.
+    half_x: f32,
+    half_y: f32,
+}
+
+#[cube]
+fn footprint(packed: &[f32], opacities: &[f32], splat: usize, alpha_min: f32) -> Footprint {
+    let at = splat * PACKED;
+    let mean_x = packed[at];
+    let mean_y = packed[at + 1];
+    let w11 = packed[at + 3];
+    let w21 = packed[at + 4];
+    let w22 = packed[at + 5];
+    let opacity = opacities[splat];
+    let ratio = opacity / alpha_min;
+    let cut = f32::ln(ratio) * 1.0001f32 + 1e-4f32;
+    // Standard deviations along x and y: L = W⁻¹ has l11 = 1/w11, l21 = -w21/(w11 w22), l22 = 1/w22.
+    let reach = f32::sqrt(2.0f32 * cut);
+    let half_x = reach / w11;
+    let slope = w21 / w11;
+    let half_y = reach * f32::sqrt(1.0f32 + slope * slope) / w22;
+    let finite = is_finite(ratio)
+        && is_finite(mean_x)
+        && is_finite(mean_y)
+        && is_finite(half_x)
+        && is_finite(half_y);
+    Footprint {
+        seen: finite && packed[at + 7] > 0.0f32 && opacity >= alpha_min,
+        mean_x,
+        mean_y,
+        w11,
+        w21,
+        w22,
+        cut,
+        half_x,
+        half_y,
+    }
+}
+
+/// First tile and end of those that the interval mean +- half reaches, of `count` in a row or column; half a pixel
+/// and one part in 10,000 of slack.
+#[cube]
+fn tile_range(mean: f32, half: f32, count: u32) -> (u32, u32) {
+    let reach = half * 1.0001f32 + 0.5f32;
+    let tile = TILE as f32;
+    let low = (mean - reach - 0.5f32) / tile;
+    let high = (mean + reach - 0.5f32) / tile + 1.0f32;
+    let limit = count as f32;
+    (
+        min(max(low, 0.0f32), limit) as u32,
+        min(max(high, 0.0f32), limit) as u32,
+    )
+}
+
+/// A lower bound of sigma at (dx, dy) from the mean, below its rounding error for long and thin splats.
+#[cube]
+fn sigma_below(f: Footprint, dx: f32, dy: f32) -> f32 {
+    let z1 = f.w11 * dx;
+    let along = f.w21 * dx;
+    let across = f.w22 * dy;
+    let rounding = 1e-6f32 * (f32::abs(along) + f32::abs(across));
+    let z2 = max(f32::abs(along + across) - rounding, 0.0f32);
+    0.5f32 * (z1 * z1 + z2 * z2)
+}
+
+/// Whether the ellipse meets the rectangle [dx0, dx1] x [dy0, dy1], relative to the mean.
+#[cube]
+fn touches(f: Footprint, dx0: f32, dx1: f32, dy0: f32, dy1: f32) -> bool {
+    let beside = dx0 > 0.0f32 || dx1 < 0.0f32;
+    let above = dy0 > 0.0f32 || dy1 < 0.0f32;
+    // Lowest point of the facing vertical edge: dσ/ddy = 0 at dy = -w21 dx / w22.
+    let edge_x = select(dx0 > 0.0f32, dx0, dx1);
+    let on_x = min(max(-f.w21 * edge_x / f.w22, dy0), dy1);
+    // Lowest point of the facing horizontal edge: dσ/ddx = 0 at dx = -w21 w22 dy / (w11² + w21²).
+    let edge_y = select(dy0 > 0.0f32, dy0, dy1);
+    let on_y = min(
+        max(
+            -f.w21 * f.w22 * edge_y / (f.w11 * f.w11 + f.w21 * f.w21),
+            dx0,
+        ),
+        dx1,
+    );
+    let hit_x = beside && sigma_below(f, edge_x, on_x) <= f.cut;
+    let hit_y = above && sigma_below(f, on_y, edge_y) <= f.cut;
+    (!beside && !above) || hit_x || hit_y
+}
+
+/// Tiles touched by the j-th splat of `order`. Counting: `offsets[j]` = their number. Emitting: their keys (tile index
+/// over all cameras), slots and splats, from slot `offsets[j]` on.
+#[cube(launch)]
+fn walk_tiles(
+    packed: &[f32],
+    opacities: &[f32],
+    order: &[u32],
+    offsets: &mut [u32],
+    keys: &mut [u32],
+    slots: &mut [u32],
+    slot_splats: &mut [u32],
+    grid: Grid,
+    #[comptime] emit: bool,
+) {
+    let j = ABSOLUTE_POS;
+    if j < grid.splats as usize {
+        let splat = order[j];
+        let f = footprint(packed, opacities, splat as usize, grid.alpha_min);
+        let mut slot = 0u32;
+        let mut end = 0u32;
+        if comptime!(emit) {
+            slot = offsets[j];
+            end = offsets[j + 1];
+        }
+        if f.seen {
+            let first_tile = splat / grid.gaussians * grid.columns * grid.rows;
+            let (x_low, x_high) = tile_range(f.mean_x, f.half_x, grid.columns);
+            let (y_low, y_high) = tile_range(f.mean_y, f.half_y, grid.rows);
+            for y in y_low..y_high {
+                for x in x_low..x_high {
+                    let dx0 = (x * TILE) as f32 + 0.5f32 - f.mean_x;
+                    let dy0 = (y * TILE) as f32 + 0.5f32 - f.mean_y;
+                    let dx1 = min(x * TILE + TILE, grid.width) as f32 - 0.5f32 - f.mean_x;
+                    let dy1 = min(y * TILE + TILE, grid.height) as f32 - 0.5f32 - f.mean_y;
+                    if touches(f, dx0, dx1, dy0, dy1) {
+                        if comptime!(emit) {
+                            if slot < end {
+                                keys[slot as usize] = first_tile + y * grid.columns + x;
+                                slots[slot as usize] = slot;
+                                slot_splats[slot as usize] = splat;
+                            }
+                        }
+                        slot += 1u32;
+                    }
+                }
+            }
+        }
+        if comptime!(emit) {
+            // Counting and emitting are two compilations of one function. Should a compiler round them differently,
+            // the slots left over go to no tile.
+            while slot < end {
+                keys[slot as usize] = grid.tiles;
+                slots[slot as usize] = slot;
+                slot_splats[slot as usize] = splat;
+                slot += 1u32;
+            }
+        } else {
+            offsets[j] = slot;
+        }
+    } else if j == grid.splats as usize {
+        if comptime!(!emit) {
+            offsets[j] = 0u32;
+        }
+    }
+}
+
+/// Sort keys of all splats: their depths.
+#[cube(launch)]
+fn depth_keys(packed: &[f32], keys: &mut [u32], splats: u32) {
+    if ABSOLUTE_POS < splats as usize {
+        keys[ABSOLUTE_POS] = ordered_bits(packed[ABSOLUTE_POS * PACKED + 2]);
+    }
+}
+
+/// First position in the ascending `keys` whose key is not less than `key`.
+#[cube]
+fn lower_bound(keys: &[u32], len: u32, key: u32) -> u32 {
+    let mut low = 0u32;
+    let mut high = len;
+    while low < high {
+        let middle = (low + high) / 2u32;
+        if keys[middle as usize] < key {
+            low = middle + 1u32;
+        } else {
+            high = middle;
+        }
+    }
+    low
+}
+
+/// Range of instances of every tile, empty ones too.
+#[cube(launch)]
+fn tile_ranges(keys: &[u32], ranges: &mut [u32], instances: u32, tiles: u32) {
+    let tile = ABSOLUTE_POS;
+    if tile < tiles as usize {
+        ranges[tile * 2] = lower_bound(keys, instances, tile as u32);
+        ranges[tile * 2 + 1] = lower_bound(keys, instances, tile as u32 + 1u32);
+    }
+}
+
+/// `out[i] = table[indices[i]]`
+#[cube(launch)]
+fn gather(indices: &[u32], table: &[u32], out: &mut [u32], len: u32) {
+    if ABSOLUTE_POS < len as usize {
+        out[ABSOLUTE_POS] = table[indices[ABSOLUTE_POS] as usize];
+    }
+}
+
+/// Lists the splats of every tile: `packed` [C, N, 9], `opacities` [C, N]. Waits for the device once, to learn the
+/// number of instances.
+///
+/// # Errors
+/// More than [`MAX_INSTANCES`] instances, or a failing device.
+pub fn intersect(
+    client: &Client,
+    packed: &Buffer,
+    opacities: &Buffer,
+    frames: &Frames,
+) -> Result<TileLists, IntersectError> {
+    let (splats, tiles) = (frames.splats(), frames.tiles());
+    let depths = Buffer::empty(client, splats);
+    if let Some((count, dim)) = per_element(splats) {
+        depth_keys::launch(
+            client,
+            count,
+            dim,
+            packed.arg(),
+            depths.arg(),
+            splats as u32,
+        );
+    }
+    let (_, order) = sort_pairs(client, &depths, &iota(client, splats), 32);
+
+    let walk = |offsets: &Buffer, keys: &Buffer, slots: &Buffer, slot_splats: &Buffer, emit| {
+        if let Some((count, dim)) = per_element(splats + 1) {
+            walk_tiles::launch(
+                client,
+                count,
+                dim,
+                packed.arg(),
+                opacities.arg(),
+                order.arg(),
+                offsets.arg(),
+                keys.arg(),
+                slots.arg(),
+                slot_splats.arg(),
+                frames.uniforms(),
+                emit,
+            );
+        }
+    };
+    let none = || Buffer::empty(client, 1);
+    let counts = Buffer::empty(client, splats + 1);
+    walk(&counts, &none(), &none(), &none(), false);
+    let (offsets, instances) =
+        exclusive_sum_with_total(client, &counts).map_err(IntersectError::Device)?;
+    if instances > MAX_INSTANCES {
+        return Err(IntersectError::TooManyInstances(instances));
+    }
+    let instances = instances as usize;
+
+    let keys = Buffer::empty(client, instances);
+    let slots = Buffer::empty(client, instances);
+    let slot_splats = Buffer::empty(client, instances);
+    if instances > 0 {
+        walk(&offsets, &keys, &slots, &slot_splats, true);
+    }
+    let (keys, slots) = sort_pairs(client, &keys, &slots, bits_for(tiles + 1));
+
+    let ranges = Buffer::empty(client, tiles * 2);
+    if let Some((count, dim)) = per_element(tiles) {
+        tile_ranges::launch(
+            client,
+            count,
+            dim,
+            keys.arg(),
+            ranges.arg(),
+            instances as u32,
+            tiles as u32,
+        );
+    }
+    let tile_splats = Buffer::empty(client, instances);
+    if let Some((count, dim)) = per_element(instances) {
+        gather::launch(
+            client,
+            count,
+            dim,
+            slots.arg(),
+            slot_splats.arg(),
+            tile_splats.arg(),
+            instances as u32,
+        );
+    }
+    Ok(TileLists {
+        instances,
+        splats: tile_splats,
+        slots,
+        ranges,
+        order,
+        offsets,
+    })
+}

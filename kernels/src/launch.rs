@@ -1,0 +1,163 @@
+//! What every stage shares on the host side: buffers with their length, and how work is folded into workgroups.
+
+use cubecl::prelude::*;
+use cubecl::server::Handle;
+
+/// Units of a workgroup in every one-dimensional kernel.
+pub const CUBE_UNITS: u32 = 256;
+/// [`CUBE_UNITS`] as an index.
+pub(crate) const CUBE_UNITS_USIZE: usize = CUBE_UNITS as usize;
+
+/// WebGPU's limit on workgroups along one dimension.
+const MAX_CUBES_PER_DIMENSION: u32 = 65_535;
+
+/// A device buffer of `len` elements of four bytes each (`f32` or `u32`), contiguous.
+///
+/// Never smaller than one element on the device, so that it can always be bound.
+#[derive(Clone, Debug)]
+pub struct Buffer {
+    handle: Handle,
+    len: usize,
+}
+
+impl Buffer {
+    /// Wraps a contiguous `handle` that holds at least `len` elements of four bytes.
+    ///
+    /// # Errors
+    /// Gives the handle back if it is smaller than that.
+    pub fn new(handle: Handle, len: usize) -> Result<Self, Handle> {
+        if handle.size_in_used() / 4 >= len as u64 {
+            Ok(Self { handle, len })
+        } else {
+            Err(handle)
+        }
+    }
+
+    /// Reserves `len` elements, not initialised.
+    pub fn empty(client: &Client, len: usize) -> Self {
+        Self {
+            handle: client.empty(len.max(1) * 4),
+            len,
+        }
+    }
+
+    /// Uploads `values`.
+    pub fn from_f32(client: &Client, values: &[f32]) -> Self {
+        Self::from_bytes(client, f32::as_bytes(values), values.len())
+    }
+
+    /// Uploads `values`.
+    pub fn from_u32(client: &Client, values: &[u32]) -> Self {
+        Self::from_bytes(client, u32::as_bytes(values), values.len())
+    }
+
+    fn from_bytes(client: &Client, bytes: &[u8], len: usize) -> Self {
+        if len == 0 {
+            return Self::empty(client, 0);
+        }
+        Self {
+            handle: client.create_from_slice(bytes),
+            len,
+        }
+    }
+
+    /// Elements.
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Whether there are no elements.
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// The device memory behind it.
+    pub fn into_handle(self) -> Handle {
+        self.handle
+    }
+
+    /// Reads the elements back; waits for the device.
+    ///
+    /// # Errors
+    /// The device's error, in words.
+    pub fn read_u32(&self, client: &Client) -> Result<Vec<u32>, String> {
+        Ok(u32::from_bytes(&self.read(client)?)[..self.len].to_vec())
+    }
+
+    /// Reads the elements back; waits for the device.
+    ///
+    /// # Errors
+    /// The device's error, in words.
+    pub fn read_f32(&self, client: &Client) -> Result<Vec<f32>, String> {
+        Ok(f32::from_bytes(&self.read(client)?)[..self.len].to_vec())
+    }
+
+    fn read(&self, client: &Client) -> Result<cubecl::bytes::Bytes, String> {
+        client
+            .read_one(self.handle.clone())
+            .map_err(|error| format!("{error:?}"))
+    }
+
+    /// The buffer as a kernel argument.
+    pub(crate) fn arg(&self) -> BufferArg {
+        // SAFETY: both constructors make sure that the handle holds `len` elements of four bytes, and every kernel of
+        // this crate views buffers as `f32` or `u32`.
+        unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len.max(1)) }
+    }
+}
+
+/// `cubes` workgroups, folded into two dimensions when there are more than one dimension can hold. Kernels see one
+/// linear `CUBE_POS`, which may run past `cubes`: they check it.
+pub(crate) fn cube_count(cubes: usize) -> CubeCount {
+    let cubes = u32::try_from(cubes).unwrap_or(u32::MAX);
+    if cubes <= MAX_CUBES_PER_DIMENSION {
+        return CubeCount::Static(cubes, 1, 1);
+    }
+    let rows = cubes.div_ceil(MAX_CUBES_PER_DIMENSION);
+    CubeCount::Static(cubes.div_ceil(rows), rows, 1)
+}
+
+/// Workgroups and their size for one unit per element; `None` if there is nothing to do.
+pub(crate) fn per_element(elements: usize) -> Option<(CubeCount, CubeDim)> {
+    if elements == 0 {
+        return None;
+    }
+    Some((
+        cube_count(elements.div_ceil(CUBE_UNITS_USIZE)),
+        CubeDim::new_1d(CUBE_UNITS),
+    ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn dims(cubes: usize) -> (u64, u64) {
+        match cube_count(cubes) {
+            CubeCount::Static(x, y, 1) => (u64::from(x), u64::from(y)),
+            other => panic!("unexpected {other:?}"),
+        }
+    }
+
+    #[test]
+    fn workgroups_fold_into_two_dimensions_and_cover_all_work() {
+        for cubes in [
+            1,
+            2,
+            65_535,
+            65_536,
+            65_537,
+            131_071,
+            1 << 24,
+            (1 << 31) + 3,
+        ] {
+            let (x, y) = dims(cubes);
+            assert!(x <= 65_535 && y <= 65_535, "{cubes}: {x} x {y}");
+            assert!(x * y >= cubes as u64, "{cubes}: {x} x {y} is too few");
+            assert!(
+                x * y - (cubes as u64) < x,
+                "{cubes}: {x} x {y} wastes a row"
+            );
+        }
+    }
+}

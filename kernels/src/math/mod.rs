@@ -1,0 +1,11 @@
+//! Small algebra for kernels. Methods instead of operators: `#[cube]` expands method calls.
+
+mod guard;
+mod mat;
+mod quat;
+mod vec;
+
+pub(crate) use guard::*;
+pub(crate) use mat::*;
+pub(crate) use quat::*;
+pub(crate) use vec::*;

@@ -1,0 +1,11 @@
+//! The kernels against the standard library and plain float64 references, on whatever wgpu adapter is there.
+
+mod blur;
+mod device;
+mod intersect;
+mod project;
+mod rasterize;
+mod reference;
+mod scan;
+mod sh;
+mod sort;

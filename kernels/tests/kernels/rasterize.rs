@@ -1,0 +1,357 @@
+//! Blending and its gradients.
+
+use splat_kernels::intersect::Frames;
+use splat_kernels::rasterize::{RasterizeInputs, RasterizeSettings, rasterize, rasterize_vjp};
+
+use crate::device::{assert_close, client, differences, download, rng, uniform, upload, wide};
+use crate::reference::{self, View};
+
+const SETTINGS: RasterizeSettings = RasterizeSettings {
+    alpha_max: 0.99,
+    transmittance_min: 9.999e-5,
+};
+
+struct Scene {
+    frames: Frames,
+    channels: usize,
+    packed: Vec<f32>,
+    colors: Vec<f32>,
+    opacities: Vec<f32>,
+    background: Option<Vec<f32>>,
+}
+
+impl Scene {
+    /// Splats of a few pixels, overlapping; opacities within `opacity`.
+    fn new(
+        cameras: usize,
+        gaussians: usize,
+        width: u32,
+        height: u32,
+        channels: usize,
+        opacity: [f32; 2],
+        seed: u64,
+    ) -> Self {
+        let mut rng = rng(seed);
+        let splats = cameras * gaussians;
+        let mut packed = Vec::new();
+        for _ in 0..splats {
+            let v = uniform(&mut rng, 6, 0.0, 1.0);
+            packed.extend([
+                v[0] * (width as f32 + 8.0) - 4.0,
+                v[1] * (height as f32 + 8.0) - 4.0,
+                1.0 + v[2] * 5.0,
+                0.1 + 0.4 * v[3],
+                0.6 * v[4] - 0.3,
+                0.1 + 0.4 * v[5],
+                1.0,
+                40.0,
+                40.0,
+            ]);
+        }
+        Self {
+            frames: Frames {
+                cameras,
+                gaussians,
+                width,
+                height,
+                alpha_min: 1.0 / 255.0,
+            },
+            channels,
+            packed,
+            colors: uniform(&mut rng, splats * channels, -0.5, 1.0),
+            opacities: uniform(&mut rng, splats, opacity[0], opacity[1]),
+            background: Some(uniform(&mut rng, cameras * channels, 0.0, 1.0)),
+        }
+    }
+
+    fn inputs(&self, client: &cubecl::client::Client) -> RasterizeInputs {
+        RasterizeInputs {
+            packed: upload(client, &self.packed),
+            colors: upload(client, &self.colors),
+            opacities: upload(client, &self.opacities),
+            background: self.background.as_ref().map(|b| upload(client, b)),
+            channels: self.channels,
+        }
+    }
+
+    /// Packed splats, colours, opacities, background in float64.
+    fn wide(&self) -> [Vec<f64>; 4] {
+        let background = self.background.clone();
+        let background =
+            background.unwrap_or_else(|| vec![0.0; self.frames.cameras * self.channels]);
+        [
+            wide(&self.packed),
+            wide(&self.colors),
+            wide(&self.opacities),
+            wide(&background),
+        ]
+    }
+
+    fn reference(&self, p: &[Vec<f64>; 4]) -> Vec<f64> {
+        let (n, d) = (self.frames.gaussians, self.channels);
+        let view = View::new(self.frames.width as usize, self.frames.height as usize);
+        (0..self.frames.cameras)
+            .flat_map(|c| {
+                reference::rasterize(
+                    &p[0][c * n * 9..(c + 1) * n * 9],
+                    &p[1][c * n * d..(c + 1) * n * d],
+                    &p[2][c * n..(c + 1) * n],
+                    &p[3][c * d..(c + 1) * d],
+                    &view,
+                )
+            })
+            .collect()
+    }
+}
+
+/// Forward and all gradients against float64 within `limit`.
+fn check(name: &str, scene: &Scene, limit: f64) {
+    let Some(client) = client() else { return };
+    let inputs = scene.inputs(&client);
+    let wide_scene = scene.wide();
+    let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
+    assert_close(
+        &format!("{name}: image"),
+        &download(&client, &output),
+        &scene.reference(&wide_scene),
+        1e-6,
+    );
+
+    let weights = uniform(&mut rng(30), output.len(), -1.0, 1.0);
+    let grad_output = upload(&client, &weights);
+    let grads = rasterize_vjp(
+        &client,
+        &inputs,
+        &state,
+        &grad_output,
+        &scene.frames,
+        &SETTINGS,
+        [true; 4],
+    );
+    let weights = wide(&weights);
+    for (which, part) in ["packed", "colors", "opacities", "background"]
+        .iter()
+        .enumerate()
+    {
+        let Some(grad) = &grads[which] else {
+            assert!(*part == "background" && scene.background.is_none());
+            continue;
+        };
+        let expected = differences(&wide_scene[which], 1e-7, |x| {
+            let mut moved = wide_scene.clone();
+            moved[which] = x.to_vec();
+            scene
+                .reference(&moved)
+                .iter()
+                .zip(&weights)
+                .map(|(a, b)| a * b)
+                .sum()
+        });
+        assert_close(
+            &format!("{name}: {part}"),
+            &download(&client, grad),
+            &expected,
+            limit,
+        );
+    }
+}
+
+#[test]
+fn images_and_gradients_agree_with_float64() {
+    check(
+        "soft splats",
+        &Scene::new(1, 40, 37, 21, 3, [0.1, 0.8], 31),
+        1e-5,
+    );
+}
+
+#[test]
+fn opaque_splats_stop_pixels_early_and_gradients_follow() {
+    check(
+        "opaque splats",
+        &Scene::new(1, 80, 20, 20, 3, [0.7, 0.98], 32),
+        1e-5,
+    );
+}
+
+#[test]
+fn two_cameras_and_no_background() {
+    let mut scene = Scene::new(2, 20, 18, 33, 2, [0.1, 0.9], 33);
+    scene.background = None;
+    check("two cameras", &scene, 1e-5);
+}
+
+#[test]
+fn any_number_of_channels() {
+    for channels in [1, 16, 17, 35] {
+        check(
+            &format!("{channels} channels"),
+            &Scene::new(1, 12, 17, 9, channels, [0.2, 0.9], 34),
+            1e-5,
+        );
+    }
+}
+
+#[test]
+fn an_image_of_one_pixel() {
+    check(
+        "one pixel",
+        &Scene::new(1, 5, 1, 1, 3, [0.2, 0.9], 35),
+        1e-5,
+    );
+}
+
+#[test]
+fn the_cap_of_alpha_stops_the_gradient_through_it() {
+    let Some(client) = client() else { return };
+    let mut scene = Scene::new(1, 1, 1, 1, 1, [0.999, 1.0], 36);
+    scene.packed[..2].copy_from_slice(&[0.5, 0.5]);
+    let inputs = scene.inputs(&client);
+    let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
+    let grad = upload(&client, &[1.0, 1.0]);
+    let [packed, colors, opacities, background] = rasterize_vjp(
+        &client,
+        &inputs,
+        &state,
+        &grad,
+        &scene.frames,
+        &SETTINGS,
+        [true; 4],
+    );
+    assert_close("alpha", &download(&client, &output)[1..], &[0.99], 1e-6);
+    assert_eq!(download(&client, &packed.unwrap()), [0.0; 9]);
+    assert_eq!(download(&client, &opacities.unwrap()), [0.0]);
+    assert_close(
+        "colour",
+        &download(&client, &colors.unwrap()),
+        &[0.99],
+        1e-6,
+    );
+    assert_close(
+        "background",
+        &download(&client, &background.unwrap()),
+        &[0.01],
+        1e-5,
+    );
+}
+
+#[test]
+fn many_faint_layers_keep_their_transmittance() {
+    let Some(client) = client() else { return };
+    let mut scene = Scene::new(1, 2000, 16, 16, 1, [0.00393, 0.005], 37);
+    for (i, row) in scene.packed.chunks_mut(9).enumerate() {
+        row.copy_from_slice(&[8.0, 8.0, 1.0 + i as f32, 1e-4, 0.0, 1e-4, 1.0, 4e4, 4e4]);
+    }
+    let inputs = scene.inputs(&client);
+    let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
+    let wide_scene = scene.wide();
+    assert_close(
+        "image",
+        &download(&client, &output),
+        &scene.reference(&wide_scene),
+        1e-5,
+    );
+    let weights = uniform(&mut rng(38), output.len(), 0.0, 1.0);
+    let [_, colors, ..] = rasterize_vjp(
+        &client,
+        &inputs,
+        &state,
+        &upload(&client, &weights),
+        &scene.frames,
+        &SETTINGS,
+        [false, true, false, false],
+    );
+    // dL/dcolour_i = Σ over pixels of T_i alpha_i g: the image is linear in the colours.
+    let (packed, opacities) = (&wide_scene[0], &wide_scene[2]);
+    let mut expected = vec![0.0; 2000];
+    for y in 0..16 {
+        for x in 0..16 {
+            let mut t = 1.0;
+            for i in 0..2000 {
+                let raw = reference::raw_alpha(
+                    &packed[i * 9..i * 9 + 9],
+                    opacities[i],
+                    x as f64 + 0.5,
+                    y as f64 + 0.5,
+                );
+                expected[i] += t * raw * f64::from(weights[(y * 16 + x) * 2]);
+                t *= 1.0 - raw;
+            }
+        }
+    }
+    assert_close(
+        "colours",
+        &download(&client, &colors.unwrap()),
+        &expected,
+        2e-5,
+    );
+}
+
+#[test]
+fn nothing_to_see_gives_the_background() {
+    let Some(client) = client() else { return };
+    let mut scene = Scene::new(2, 0, 19, 5, 2, [0.1, 0.2], 39);
+    scene.background = Some(vec![0.25, 0.5, 0.75, 1.0]);
+    let inputs = scene.inputs(&client);
+    let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
+    assert_eq!(
+        wide(&download(&client, &output)),
+        scene.reference(&scene.wide())
+    );
+    let grad = upload(&client, &vec![1.0; output.len()]);
+    let grads = rasterize_vjp(
+        &client,
+        &inputs,
+        &state,
+        &grad,
+        &scene.frames,
+        &SETTINGS,
+        [true; 4],
+    );
+    let [packed, colors, opacities, background] = grads.map(|g| download(&client, &g.unwrap()));
+    assert!(packed.is_empty() && colors.is_empty() && opacities.is_empty());
+    assert_eq!(background, [95.0; 4]);
+}
+
+#[test]
+fn only_the_wanted_gradients_and_the_same_bits_every_time() {
+    let Some(client) = client() else { return };
+    let scene = Scene::new(1, 60, 40, 40, 3, [0.1, 0.9], 40);
+    let inputs = scene.inputs(&client);
+    let weights = uniform(&mut rng(41), 40 * 40 * 4, -1.0, 1.0);
+    let run = |wanted| {
+        let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
+        let grad = upload(&client, &weights);
+        let grads = rasterize_vjp(
+            &client,
+            &inputs,
+            &state,
+            &grad,
+            &scene.frames,
+            &SETTINGS,
+            wanted,
+        );
+        (
+            download(&client, &output),
+            grads.map(|g| g.map(|g| download(&client, &g))),
+        )
+    };
+    let first = run([true; 4]);
+    for _ in 0..3 {
+        assert_eq!(run([true; 4]), first);
+    }
+    for wanted in [
+        [true, false, false, false],
+        [false, true, false, false],
+        [false, false, true, true],
+        [false; 4],
+    ] {
+        let (_, some) = run(wanted);
+        for i in 0..4 {
+            assert_eq!(some[i].is_some(), wanted[i]);
+            if let (Some(some), Some(all)) = (&some[i], &first.1[i]) {
+                assert_close("wanted alone", some, &wide(all), 1e-6);
+            }
+        }
+    }
+}
