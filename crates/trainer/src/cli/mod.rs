@@ -50,6 +50,7 @@ enum Command {
     Eval(eval::EvalArgs),
     Render(render::RenderArgs),
     Info(info::InfoArgs),
+    Gradcheck(GradcheckArgs),
 }
 
 /// Runs the program on the process's arguments.
@@ -61,6 +62,7 @@ pub fn main() -> ExitCode {
         Command::Eval(args) => eval::run(args, global),
         Command::Render(args) => render::run(args, global),
         Command::Info(args) => info::run(args, global),
+        Command::Gradcheck(args) => gradcheck::run(args, global),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
