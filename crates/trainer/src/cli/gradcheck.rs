@@ -1,18 +1,20 @@
-//! `splat gradcheck`: our gradients against those of PyTorch.
+//! `splat gradcheck`: every gradient against fixtures.
 
 use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
 use super::{Failure, GlobalArgs, device, print};
-use crate::gradcheck::{check_file, json, table};
+use crate::gradcheck::{self, check_file};
 use crate::report::metrics::write_json;
 
 /// Check every gradient against fixtures written by PyTorch
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   splat gradcheck --device cpu --precision f64 tests/fixtures/*.safetensors
-  splat gradcheck --device wgpu --json gradients.json tests/fixtures/*.safetensors")]
+  splat gradcheck --device wgpu --json gradients.json tests/fixtures/*.safetensors
+
+Exit status: 0 every gradient holds, 1 one does not, 2 bad input.")]
 pub struct GradcheckArgs {
     /// Fixture files (safetensors)
     #[arg(required = true, value_name = "FILE")]
@@ -35,28 +37,34 @@ pub enum Precision {
     F64,
 }
 
+impl From<Precision> for gradcheck::Precision {
+    fn from(precision: Precision) -> Self {
+        match precision {
+            Precision::F32 => Self::F32,
+            Precision::F64 => Self::F64,
+        }
+    }
+}
+
 /// Runs the command.
 pub(super) fn run(args: &GradcheckArgs, global: &GlobalArgs) -> Result<(), Failure> {
-    let chosen = device::open(global)?;
-    let precision = match args.precision {
-        Precision::F32 => crate::gradcheck::Precision::F32,
-        Precision::F64 => crate::gradcheck::Precision::F64,
-    };
-    let mut reports = Vec::with_capacity(args.files.len());
-    for file in &args.files {
-        let report = check_file(file, &chosen.device, precision)?;
-        print(&table(std::slice::from_ref(&report)));
-        reports.push(report);
-    }
+    let device = device::open(global)?.device;
+    let precision = args.precision.into();
+    let reports = args
+        .files
+        .iter()
+        .map(|path| check_file(path, &device, precision))
+        .collect::<Result<Vec<_>, _>>()?;
+    print(&gradcheck::table(&reports));
     if let Some(path) = &args.json {
-        write_json(path, &json(&reports))?;
+        write_json(path, &gradcheck::json(&reports))?;
     }
     let failed = reports.iter().filter(|report| !report.pass).count();
-    match failed {
-        0 => Ok(()),
-        _ => Err(Failure::Check(format!(
-            "{failed} of {} files are outside their gates",
+    if failed > 0 {
+        return Err(Failure::Check(format!(
+            "{failed} of {} fixture(s) do not agree",
             reports.len()
-        ))),
+        )));
     }
+    Ok(())
 }

@@ -17,7 +17,7 @@ use clap::{Args, Parser, Subcommand};
 
 pub use device::DeviceChoice;
 pub use failure::Failure;
-pub use gradcheck::GradcheckArgs;
+pub use gradcheck::{GradcheckArgs, Precision};
 
 /// Train, render and inspect Gaussian splats.
 #[derive(Debug, Parser)]

@@ -3,6 +3,7 @@
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
+use std::sync::Arc;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
@@ -128,11 +129,15 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         capture.points.len()
     ));
 
+    // What cannot be written down should be known before the training, not after it.
+    let config_path = out.join("config.toml");
+    let config_text = config_text(&config_path, args, &chosen, &config)?;
+
     let done = checkpoint.as_ref().map_or(0, Checkpoint::step);
     let progress = Progress::new(config.steps as u64, done as u64, global.quiet);
     let progress = Rc::new(RefCell::new(progress));
     let shown = Rc::clone(&progress);
-    let capture = std::sync::Arc::new(capture);
+    let capture = Arc::new(capture);
     let mut trainer = Trainer::builder()
         .capture(capture.clone())
         .config(config.clone())
@@ -152,7 +157,10 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     progress.borrow().finish();
     let trained = trained?;
 
-    write_config(&out, args, &chosen, &config)?;
+    write_atomically(&config_path, config_text.as_bytes()).map_err(|source| ReportError::Io {
+        path: config_path,
+        source,
+    })?;
     if trained.steps < config.steps {
         trained.checkpoint.save(&out.join(CHECKPOINT))?;
         global.say(format_args!(
@@ -179,23 +187,20 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
 }
 
 /// Everything needed to repeat the run, as TOML.
-fn write_config(
-    out: &Path,
+fn config_text(
+    path: &Path,
     args: &TrainArgs,
     chosen: &ChosenDevice,
     config: &TrainConfig,
-) -> Result<(), Failure> {
-    let path = out.join("config.toml");
-    let text = format!(
+) -> Result<String, Failure> {
+    Ok(format!(
         "# splat {} on {}; to repeat: splat train {} --config {}\n{}",
         env!("CARGO_PKG_VERSION"),
         chosen.name,
         args.capture.display(),
         path.display(),
         toml::to_string(config)?
-    );
-    write_atomically(&path, text.as_bytes()).map_err(|source| ReportError::Io { path, source })?;
-    Ok(())
+    ))
 }
 
 /// Writes the scene, its pictures, curves and figures.

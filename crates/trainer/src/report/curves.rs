@@ -161,7 +161,7 @@ fn padded(values: impl Iterator<Item = f64>) -> Option<Range<f64>> {
     let (least, most) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |range, value| {
         (range.0.min(value), range.1.max(value))
     });
-    if !(least <= most) {
+    if least > most {
         return None;
     }
     let pad = (0.05 * (most - least)).max(1e-6 * most.abs()).max(1e-9);

@@ -45,37 +45,31 @@ struct FileCamera {
     viewmat: [[f64; 4]; 4],
 }
 
-/// A camera file: one camera or a list.
-#[derive(Debug, Deserialize)]
-#[serde(untagged)]
-enum CameraFile {
-    One(FileCamera),
-    Many(Vec<FileCamera>),
-}
-
 /// The cameras of a file, by their names or their place in it.
 pub(super) fn of_file(path: &Path) -> Result<Vec<(String, Camera)>, Failure> {
     let bad = |reason: String| Failure::BadInput(format!("{}: {reason}", path.display()));
     let text = std::fs::read_to_string(path).map_err(|error| bad(error.to_string()))?;
-    let file = serde_json::from_str(&text).map_err(|error| {
+    let read = || -> serde_json::Result<Vec<FileCamera>> {
+        match serde_json::from_str(&text)? {
+            list @ serde_json::Value::Array(_) => serde_json::from_value(list),
+            one => Ok(vec![serde_json::from_value(one)?]),
+        }
+    };
+    let cameras = read().map_err(|error| {
         bad(format!(
             "neither a camera nor a list of cameras (see `splat render --help`): {error}"
         ))
     })?;
-    let cameras = match file {
-        CameraFile::One(camera) => vec![camera],
-        CameraFile::Many(cameras) => cameras,
-    };
     if cameras.is_empty() {
         return Err(bad("no camera in it".to_owned()));
     }
-    let named = |(index, camera): (usize, FileCamera)| {
+    let named = |(index, camera): (usize, FileCamera)| -> Result<(String, Camera), Failure> {
         let name = camera.name.clone();
         let name = name.unwrap_or_else(|| format!("camera_{index:04}"));
-        let camera = camera
-            .checked()
-            .map_err(|reason| bad(format!("camera {index} (`{name}`): {reason}")))?;
-        Ok((name, camera))
+        match camera.checked() {
+            Ok(camera) => Ok((name, camera)),
+            Err(reason) => Err(bad(format!("camera {index} (`{name}`): {reason}"))),
+        }
     };
     cameras.into_iter().enumerate().map(named).collect()
 }
