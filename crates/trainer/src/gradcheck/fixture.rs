@@ -375,7 +375,7 @@ mod tests {
         ];
         let pictures: [(&str, &[usize]); 2] = [("image", &[1, 2, 3]), ("alpha", &[1, 2, 1])];
         let ones = |name: String, shape: &[usize]| {
-            let count = shape.iter().product();
+            let count: usize = shape.iter().product();
             let bytes = vec![1.0f64.to_le_bytes(); count].concat();
             (name, Dtype::F64, shape.to_vec(), bytes)
         };

@@ -56,7 +56,7 @@ impl std::fmt::Display for Precision {
 #[derive(Debug, thiserror::Error)]
 pub enum GradcheckError {
     /// The file cannot be read.
-    #[error("{}: {source}", file.display())]
+    #[error("{}: {source}", .file.display())]
     Read {
         /// The fixture.
         file: PathBuf,
@@ -64,7 +64,7 @@ pub enum GradcheckError {
         source: std::io::Error,
     },
     /// The file is not safetensors.
-    #[error("{}: not a safetensors file: {reason}", file.display())]
+    #[error("{}: not a safetensors file: {reason}", .file.display())]
     Format {
         /// The fixture.
         file: PathBuf,
@@ -72,7 +72,7 @@ pub enum GradcheckError {
         reason: String,
     },
     /// A tensor is missing or does not fit.
-    #[error("{}: tensor `{tensor}`: {reason}", file.display())]
+    #[error("{}: tensor `{tensor}`: {reason}", .file.display())]
     Tensor {
         /// The fixture.
         file: PathBuf,
@@ -82,7 +82,7 @@ pub enum GradcheckError {
         reason: String,
     },
     /// A metadata entry does not fit.
-    #[error("{}: metadata `{key}`: {reason}", file.display())]
+    #[error("{}: metadata `{key}`: {reason}", .file.display())]
     Metadata {
         /// The fixture.
         file: PathBuf,
@@ -92,7 +92,7 @@ pub enum GradcheckError {
         reason: String,
     },
     /// The ops refuse the scene.
-    #[error("{}: {source}", file.display())]
+    #[error("{}: {source}", .file.display())]
     Op {
         /// The fixture.
         file: PathBuf,
@@ -100,7 +100,7 @@ pub enum GradcheckError {
         source: OpError,
     },
     /// The device cannot run the check.
-    #[error("{}: {reason}", file.display())]
+    #[error("{}: {reason}", .file.display())]
     Device {
         /// The fixture.
         file: PathBuf,

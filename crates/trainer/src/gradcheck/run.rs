@@ -113,7 +113,10 @@ pub fn run(
     let rotation = viewmats.clone().narrow(1, 0, 3).narrow(2, 0, 3); // [C, 3, 3]
     let translation = viewmats.clone().narrow(1, 0, 3).narrow(2, 3, 1); // [C, 3, 1]
     let centre = (rotation * translation).sum_dim(1).neg(); // [C, 1, 3]
-    let mut directions = means.clone().unsqueeze_dim::<3>(0) - centre; // [C, N, 3]
+    // Repeated rather than broadcast, and `-1` rather than N: with N = 0, `expand` panics and
+    // `reshape` reads the 0 as "keep the length of this dimension".
+    let mut directions = means.clone().reshape([1, -1, 3]).repeat_dim(0, c) // [C, N, 3]
+        - centre.repeat_dim(1, n);
     if bug == Some(Bug::DirectionDetached) {
         directions = directions.detach();
     }
@@ -134,7 +137,7 @@ pub fn run(
             ),
         ),
     };
-    let mut blended = opacities.clone().reshape([1, n]).expand([c, n]);
+    let mut blended = opacities.clone().reshape([1, -1]).repeat_dim(0, c); // [C, N]
     if fixture.antialias {
         blended = blended * projected.compensations();
     }
@@ -199,7 +202,8 @@ pub fn run(
 fn quaternion_normalisation_skipped(quats: Tensor<2>, scales: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
     let length = quats.clone().square().sum_dim(1).sqrt();
     let unit = (quats.clone() / length).detach();
-    let quats = unit + quats.clone() - quats.detach();
+    // The difference first: it is exactly zero in every precision.
+    let quats = unit + (quats.clone() - quats.detach());
     let square = quats.clone().square().sum_dim(1);
     (quats, scales * square)
 }
