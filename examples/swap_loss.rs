@@ -35,14 +35,19 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let difference = |axis| edges(rendered.image(), axis) - edges(view.image.clone(), axis);
             Ok(charbonnier(difference(1)) + charbonnier(difference(2)))
         });
-    let config = TrainConfig { steps, ..TrainConfig::default() };
+    let config = TrainConfig {
+        steps,
+        ..TrainConfig::default()
+    };
     let trained = Trainer::builder()
         .capture(capture.clone())
         .config(config.clone())
         .device(device.clone())
         .loss(loss)
         .on_progress(|p| match p.history.losses.last() {
-            Some(l) if p.step.is_multiple_of(50) => println!("step {:5}  {:?} {:?}", p.step, p.history.terms, l.terms),
+            Some(l) if p.step.is_multiple_of(50) => {
+                println!("step {:5}  {:?} {:?}", p.step, p.history.terms, l.terms)
+            }
             _ => {}
         })
         .build()?
@@ -51,6 +56,11 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let held_out: Vec<_> = capture.test_views().collect();
     let settings = config.render_settings(3);
     let scores = evaluate(&trained.gaussians, &held_out, &settings, &device, |_, _| {})?;
-    println!("held out: {:.2} dB PSNR, {:.4} SSIM, {} Gaussians", scores.psnr, scores.ssim, trained.gaussians.len());
+    println!(
+        "held out: {:.2} dB PSNR, {:.4} SSIM, {} Gaussians",
+        scores.psnr,
+        scores.ssim,
+        trained.gaussians.len()
+    );
     Ok(())
 }

@@ -186,10 +186,8 @@ impl Optimizer for SplatAdam {
         let correction_1 = 1.0 - self.beta_1.powf(time);
         let correction_2 = (1.0 - self.beta_2.powf(time)).sqrt();
 
-        state.moment_1 =
-            state.moment_1 * self.beta_1 + grad.clone() * (1.0 - self.beta_1);
-        state.moment_2 =
-            state.moment_2 * self.beta_2 + grad.square() * (1.0 - self.beta_2);
+        state.moment_1 = state.moment_1 * self.beta_1 + grad.clone() * (1.0 - self.beta_1);
+        state.moment_2 = state.moment_2 * self.beta_2 + grad.square() * (1.0 - self.beta_2);
         // m / c1 / (sqrt(v) / c2 + eps) = (c2 / c1) m / (sqrt(v) + c2 eps)
         let root = state.moment_2.clone().sqrt() + correction_2 * self.epsilon;
         let delta = state.moment_1.clone() / root * (lr * correction_2 / correction_1);

@@ -84,10 +84,7 @@ impl Gaussians {
 
     /// Highest degree of spherical harmonics that the coefficients can hold.
     pub fn sh_degree(&self) -> usize {
-        let count = 1 + self
-            .sh_rest
-            .as_ref()
-            .map_or(0, |rest| rest.val().dims()[1]);
+        let count = 1 + self.sh_rest.as_ref().map_or(0, |rest| rest.val().dims()[1]);
         (0..=SH_DEGREE_MAX)
             .rev()
             .find(|degree| sh_coefficient_count(*degree) <= count)
@@ -123,7 +120,7 @@ pub(crate) fn host<const R: usize>(tensor: Tensor<R>) -> Vec<f32> {
     tensor
         .into_data()
         .convert::<f32>()
-        .into_vec()
+        .try_into_vec()
         .expect("just converted to f32")
 }
 

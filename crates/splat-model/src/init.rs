@@ -65,7 +65,10 @@ pub fn splats_from_points(
     if positions.is_empty() {
         return Err(InitError::NoPoints);
     }
-    if let Some(index) = positions.iter().position(|p| p.iter().any(|x| !x.is_finite())) {
+    if let Some(index) = positions
+        .iter()
+        .position(|p| p.iter().any(|x| !x.is_finite()))
+    {
         return Err(InitError::NotFinite { index });
     }
     let n = positions.len();
@@ -77,9 +80,8 @@ pub fn splats_from_points(
             [scale.ln() as f32; 3]
         })
         .collect();
-    let sh0 = |color: &[u8; 3]| {
-        color.map(|channel| ((f64::from(channel) / 255.0 - 0.5) / SH_C0) as f32)
-    };
+    let sh0 =
+        |color: &[u8; 3]| color.map(|channel| ((f64::from(channel) / 255.0 - 0.5) / SH_C0) as f32);
     let opacity = settings.opacity.clamp(1e-6, 1.0 - 1e-6);
     Ok(SplatData {
         means: positions.to_vec(),
@@ -136,7 +138,13 @@ mod tests {
 
     #[test]
     fn scales_come_from_the_three_nearest_points() {
-        let positions = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 3.0], [9.0; 3]];
+        let positions = [
+            [0.0, 0.0, 0.0],
+            [1.0, 0.0, 0.0],
+            [0.0, 2.0, 0.0],
+            [0.0, 0.0, 3.0],
+            [9.0; 3],
+        ];
         let splats =
             splats_from_points(&positions, &[[255, 0, 128]; 5], 1.0, &Default::default()).unwrap();
         let expected = ((1.0 + 4.0 + 9.0) / 3.0f64).sqrt().ln();

@@ -68,22 +68,26 @@ pub fn render_projected(
     settings: &RenderSettings,
 ) -> Result<Rendered, OpError> {
     let degree = settings.sh_degree.min(gaussians.sh_degree());
-    let dirs = gaussians.means.val().unsqueeze::<3>() - cameras.centers();
+    let [_, n, _] = projected.packed().dims();
+    // `-1` and repeats instead of broadcasts, because N may be 0.
+    let means = gaussians.means.val().reshape([1, -1, 3]);
+    let dirs = means - cameras.centers().repeat_dim(1, n);
     let colors = spherical_harmonics(gaussians.sh_coefficients(degree), dirs, degree)?;
     let colors = (colors + 0.5).clamp_min(0.0);
+    let [count, _, _] = colors.dims();
     let background = settings.background.map(|color| {
-        let [cameras, _, _] = colors.dims();
-        Tensor::<1>::from_floats(color, &colors.device())
-            .unsqueeze::<2>()
-            .expand([cameras, 3])
+        let color = Tensor::<1>::from_floats(color, &colors.device());
+        color.reshape([1, 3]).repeat_dim(0, count)
     });
-    let opacities = gaussians.opacities().unsqueeze::<2>();
-    let opacities = if settings.antialias {
-        opacities * projected.compensations()
-    } else {
-        let [cameras, _, _] = projected.packed().dims();
-        let n = gaussians.len();
-        opacities.expand([cameras, n])
-    };
-    rasterize(projected, colors, opacities, background, &settings.rasterize)
+    let mut opacities = gaussians.opacities().reshape([1, -1]).repeat_dim(0, count);
+    if settings.antialias {
+        opacities = opacities * projected.compensations();
+    }
+    rasterize(
+        projected,
+        colors,
+        opacities,
+        background,
+        &settings.rasterize,
+    )
 }

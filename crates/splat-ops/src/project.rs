@@ -132,12 +132,7 @@ pub fn project(
     check.tensor("means", &means, [None, Some(3)], "[N, 3]")?;
     check.tensor("quats", &quats, [Some(n), Some(4)], "[N, 4]")?;
     check.tensor("scales", &scales, [Some(n), Some(3)], "[N, 3]")?;
-    check.tensor(
-        "viewmats",
-        &viewmats,
-        [None, Some(4), Some(4)],
-        "[C, 4, 4]",
-    )?;
+    check.tensor("viewmats", &viewmats, [None, Some(4), Some(4)], "[C, 4, 4]")?;
     check.tensor("intrinsics", &intrinsics, [Some(c), Some(4)], "[C, 4]")?;
     check_size(&check, size)?;
     if c == 0 {

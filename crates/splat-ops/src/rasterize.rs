@@ -60,9 +60,13 @@ pub fn rasterize<const DC: usize, const DO: usize>(
     let check = Checker::new("rasterize", "projected", &packed)?;
 
     let channels = *colors.dims().last().unwrap_or(&0);
+    // N is left to `-1`: Burn's reshape reads a 0 as "keep this dimension", and N may be 0.
+    let count = |length: usize| length as i32;
     let colors: Tensor<3> = match colors.dims().as_slice() {
-        [cc, cn, d] if *cc == c && *cn == n && *d > 0 => colors.reshape([c, n, channels]),
-        [cn, d] if *cn == n && *d > 0 => colors.reshape([1, n, channels]).expand([c, n, channels]),
+        [cc, cn, d] if *cc == c && *cn == n && *d > 0 => {
+            colors.reshape([count(c), -1, count(channels)])
+        }
+        [cn, d] if *cn == n && *d > 0 => colors.reshape([1, -1, count(channels)]).repeat_dim(0, c),
         other => {
             return Err(OpError::Shape {
                 op: "rasterize",
@@ -73,8 +77,8 @@ pub fn rasterize<const DC: usize, const DO: usize>(
         }
     };
     let opacities: Tensor<2> = match opacities.dims().as_slice() {
-        [oc, on] if *oc == c && *on == n => opacities.reshape([c, n]),
-        [on] if *on == n => opacities.reshape([1, n]).expand([c, n]),
+        [oc, on] if *oc == c && *on == n => opacities.reshape([count(c), -1]),
+        [on] if *on == n => opacities.reshape([1, -1]).repeat_dim(0, c),
         other => {
             return Err(OpError::Shape {
                 op: "rasterize",

@@ -55,7 +55,7 @@ pub fn evaluate(
             ssim: scalar(ssim(image.clone(), target, &SsimSettings::default())?),
         });
         let picture = image.into_data().convert::<f32>();
-        each(view, picture.into_vec().unwrap_or_default());
+        each(view, picture.try_into_vec().unwrap_or_default());
     }
     Ok(Scores::of_views(scores))
 }

@@ -199,7 +199,8 @@ impl AdaptiveDensity {
         let mut clones = Vec::new();
         let mut splits = Vec::new();
         for row in 0..splats.len() {
-            let grows = gradients[row] > settings.grow_gradient && clones.len() + splits.len() < room;
+            let grows =
+                gradients[row] > settings.grow_gradient && clones.len() + splits.len() < room;
             if grows && scale(row) > settings.split_scale {
                 splits.push(row);
                 continue;
@@ -252,6 +253,10 @@ impl AdaptiveDensity {
         let rotation = Quat::from_xyzw(x, y, z, w).normalize();
         let offset = rotation * (scales * normal);
         // A quaternion without length has no axes to draw along.
-        if offset.is_finite() { offset.to_array() } else { [0.0; 3] }
+        if offset.is_finite() {
+            offset.to_array()
+        } else {
+            [0.0; 3]
+        }
     }
 }

@@ -7,9 +7,9 @@ mod project;
 mod rasterize;
 mod spherical_harmonics;
 
+use burn::backend::autodiff::NodeId;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::NodeId;
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
 use crate::backend::{Background, SplatBackend, SplatOps};

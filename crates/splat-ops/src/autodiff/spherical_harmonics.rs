@@ -33,9 +33,8 @@ pub(super) fn spherical_harmonics<B: SplatBackend, C: CheckpointStrategy>(
         .compute_bound()
         .stateful();
     let inputs = inputs.map(|input| input.into_primitive());
-    let forward = |[coeffs, dirs]: [FloatTensor<B>; 2]| {
-        B::spherical_harmonics_forward(coeffs, dirs, degree)
-    };
+    let forward =
+        |[coeffs, dirs]: [FloatTensor<B>; 2]| B::spherical_harmonics_forward(coeffs, dirs, degree);
     match prep {
         OpsKind::Tracked(prep) => {
             let output = forward(inputs.clone());

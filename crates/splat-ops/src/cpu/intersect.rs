@@ -307,10 +307,16 @@ mod tests {
             }
             needed += visible.iter().filter(|v| **v).count();
             for (tile, (visible, listed)) in visible.iter().zip(&listed).enumerate() {
-                assert!(!visible || *listed, "tile {tile} dropped: {row:?} {opacity}");
+                assert!(
+                    !visible || *listed,
+                    "tile {tile} dropped: {row:?} {opacity}"
+                );
             }
         }
         // Needles pass between pixel centres, and the last tiles reach beyond the image.
-        assert!(kept as f64 <= 1.10 * needed as f64, "{kept} tiles for {needed}");
+        assert!(
+            kept as f64 <= 1.10 * needed as f64,
+            "{kept} tiles for {needed}"
+        );
     }
 }

@@ -47,10 +47,7 @@ pub(super) fn apply<T: Real>(m: &Mat3<T>, v: Vec3<T>) -> Vec3<T> {
 /// `v^T M`, that is `M^T v`.
 #[inline(always)]
 pub(super) fn apply_transposed<T: Real>(m: &Mat3<T>, v: Vec3<T>) -> Vec3<T> {
-    add(
-        add(scale(m[0], v[0]), scale(m[1], v[1])),
-        scale(m[2], v[2]),
-    )
+    add(add(scale(m[0], v[0]), scale(m[1], v[1])), scale(m[2], v[2]))
 }
 
 /// `a b^T`.

@@ -58,12 +58,8 @@ impl<T: Real> Camera<T> {
             T::of(args.size.height.into()),
         );
         let margin = T::of(args.settings.clamp_margin);
-        let bounds = |f: T, c: T, side: T| {
-            (
-                -(c + margin * side) / f,
-                (side - c + margin * side) / f,
-            )
-        };
+        let bounds =
+            |f: T, c: T, side: T| (-(c + margin * side) / f, (side - c + margin * side) / f);
         Self {
             w: [row(0), row(1), row(2)],
             t: [viewmat[3], viewmat[7], viewmat[11]],
@@ -149,7 +145,10 @@ impl<T: Real> Splat<T> {
         let (a, b) = (n1 + e, dot(v1, v2));
         let det = minors2 + e * (n1 + n2) + e * e;
 
-        let mean = [camera.fx * u_free + camera.cx, camera.fy * v_free + camera.cy];
+        let mean = [
+            camera.fx * u_free + camera.cx,
+            camera.fy * v_free + camera.cy,
+        ];
         let extent = [camera.reach * a.sqrt(), camera.reach * (n2 + e).sqrt()];
         let reaches = mean[0] + extent[0] > T::ZERO
             && mean[0] - extent[0] < camera.width

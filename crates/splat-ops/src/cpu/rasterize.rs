@@ -430,7 +430,12 @@ pub(super) fn backward<T: Real>(
                 *sum += value;
             }
         }
-        reduce(&partials, lists, &mut sums[index * n * width..(index + 1) * n * width], width);
+        reduce(
+            &partials,
+            lists,
+            &mut sums[index * n * width..(index + 1) * n * width],
+            width,
+        );
     }
 
     let column = |from: usize, length: usize| -> Vec<T> {
@@ -585,8 +590,14 @@ impl<T: Real> BackwardTile<T> {
             let Some(splat) = camera.splat(splats[place]) else {
                 continue;
             };
-            let [mut z1_sum, mut z2_sum, mut w11_sum, mut w21_sum, mut w22_sum, mut o_sum] =
-                [[T::ZERO; TILE]; GEOMETRY];
+            let [
+                mut z1_sum,
+                mut z2_sum,
+                mut w11_sum,
+                mut w21_sum,
+                mut w22_sum,
+                mut o_sum,
+            ] = [[T::ZERO; TILE]; GEOMETRY];
             color_sums.fill([T::ZERO; TILE]);
             for row in splat.rows(ty * TILE) {
                 let y = T::of((ty * TILE + row) as f64 + 0.5);
@@ -609,8 +620,7 @@ impl<T: Real> BackwardTile<T> {
                     let (z1, z2, falloff) = splat.falloff(dx, dy);
                     let raw = splat.opacity * falloff;
                     let alpha = thresholds.alpha(raw);
-                    let blended =
-                        thresholds.seen(raw) & (self.last[row][i] > place as u32);
+                    let blended = thresholds.seen(raw) & (self.last[row][i] > place as u32);
                     let passes = T::ONE - alpha;
                     let after = self.transmittance[row][i];
                     let before = after / passes;

@@ -86,15 +86,27 @@ fn basis_gradient<T: Real>(degree: usize, [x, y, z]: Vec3<T>) -> [Vec3<T>; COUNT
         d[9] = scale([k(6.0) * x * y, k(3.0) * (xx - yy), o], -k(C3[0]));
         d[10] = scale([y * z, x * z, x * y], k(C3[1]));
         d[11] = scale(
-            [-k(2.0) * x * y, k(4.0) * zz - xx - k(3.0) * yy, k(8.0) * y * z],
+            [
+                -k(2.0) * x * y,
+                k(4.0) * zz - xx - k(3.0) * yy,
+                k(8.0) * y * z,
+            ],
             -k(C3[2]),
         );
         d[12] = scale(
-            [-k(6.0) * x * z, -k(6.0) * y * z, k(6.0) * zz - k(3.0) * (xx + yy)],
+            [
+                -k(6.0) * x * z,
+                -k(6.0) * y * z,
+                k(6.0) * zz - k(3.0) * (xx + yy),
+            ],
             k(C3[3]),
         );
         d[13] = scale(
-            [k(4.0) * zz - k(3.0) * xx - yy, -k(2.0) * x * y, k(8.0) * x * z],
+            [
+                k(4.0) * zz - k(3.0) * xx - yy,
+                -k(2.0) * x * y,
+                k(8.0) * x * z,
+            ],
             -k(C3[2]),
         );
         d[14] = scale([k(2.0) * x * z, -k(2.0) * y * z, xx - yy], k(C3[4]));
@@ -196,8 +208,7 @@ pub(super) fn backward<T: Real>(
                 let coeffs = &coeffs[row % n * k * 3..][..count * 3];
                 let grad: Vec3<T> = core::array::from_fn(|i| grad[3 * row + i]);
                 let mut sum = [T::ZERO; 3];
-                for (coeff, derivative) in
-                    coeffs.chunks_exact(3).zip(basis_gradient(degree, unit))
+                for (coeff, derivative) in coeffs.chunks_exact(3).zip(basis_gradient(degree, unit))
                 {
                     let weight = dot(grad, [coeff[0], coeff[1], coeff[2]]);
                     for (sum, derivative) in sum.iter_mut().zip(derivative) {

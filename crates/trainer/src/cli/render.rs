@@ -5,7 +5,7 @@ mod cameras;
 use std::collections::HashSet;
 use std::path::PathBuf;
 
-use burn::tensor::{Device, Tensor};
+use burn::tensor::Tensor;
 use clap::{Args, ValueEnum};
 use splat_model::ops::{OpError, Projected, rasterize};
 use splat_model::{CameraTensors, Gaussians, RenderSettings, project_gaussians, render_projected};
@@ -169,7 +169,7 @@ fn file_stem(name: &str) -> String {
 
 fn host<const R: usize>(tensor: Tensor<R>) -> Vec<f32> {
     let data = tensor.into_data().convert::<f32>();
-    data.into_vec().unwrap_or_default()
+    data.try_into_vec().unwrap_or_default()
 }
 
 #[cfg(test)]

@@ -121,7 +121,10 @@ impl Checkpoint {
             .tensors
             .iter()
             .map(|(name, shape, values)| {
-                let bytes = values.iter().flat_map(|value| value.to_le_bytes()).collect();
+                let bytes = values
+                    .iter()
+                    .flat_map(|value| value.to_le_bytes())
+                    .collect();
                 (name.as_str(), shape.as_slice(), bytes)
             })
             .collect();
@@ -160,8 +163,7 @@ impl Checkpoint {
         let (_, header) = SafeTensors::read_metadata(&bytes).map_err(bad)?;
         let meta = header.metadata().as_ref().and_then(|map| map.get(META));
         let meta = meta.ok_or_else(|| format("it was not written by `splat train`".into()))?;
-        let meta: Meta =
-            serde_json::from_str(meta).map_err(|error| format(error.to_string()))?;
+        let meta: Meta = serde_json::from_str(meta).map_err(|error| format(error.to_string()))?;
         if meta.version != VERSION {
             return Err(format(format!(
                 "version {}, this program reads {VERSION}",
@@ -176,10 +178,16 @@ impl Checkpoint {
                 continue;
             }
             if view.dtype() != Dtype::F32 {
-                return Err(format(format!("tensor `{name}` is {:?}, not F32", view.dtype())));
+                return Err(format(format!(
+                    "tensor `{name}` is {:?}, not F32",
+                    view.dtype()
+                )));
             }
             let (chunks, _) = view.data().as_chunks::<4>();
-            let values = chunks.iter().map(|bytes| f32::from_le_bytes(*bytes)).collect();
+            let values = chunks
+                .iter()
+                .map(|bytes| f32::from_le_bytes(*bytes))
+                .collect();
             tensors.push((name, view.shape().to_vec(), values));
         }
         Ok(Self {
@@ -278,7 +286,12 @@ fn param_ids(gaussians: &Gaussians) -> Vec<(String, String)> {
         ("opacity_logits", gaussians.opacity_logits.id),
         ("sh0", gaussians.sh0.id),
     ];
-    ids.extend(gaussians.sh_rest.as_ref().map(|param| ("sh_rest", param.id)));
+    ids.extend(
+        gaussians
+            .sh_rest
+            .as_ref()
+            .map(|param| ("sh_rest", param.id)),
+    );
     ids.into_iter()
         .map(|(name, id)| (name.to_owned(), id.val().to_string()))
         .collect()

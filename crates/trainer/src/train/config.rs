@@ -93,13 +93,19 @@ impl TrainConfig {
             .iter()
             .find(|(_, value)| !(value.is_finite() && *value > 0.0))
         {
-            return Some(format!("`{field}` must be positive and finite, it is {value}"));
+            return Some(format!(
+                "`{field}` must be positive and finite, it is {value}"
+            ));
         }
         if let Some((field, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
             return Some(format!("`{field}` must lie in [0, 1), it is {value}"));
         }
         let highest = splat_model::ops::SH_DEGREE_MAX;
-        (self.init.sh_degree > highest)
-            .then(|| format!("`init.sh_degree` must be 0 to {highest}, it is {}", self.init.sh_degree))
+        (self.init.sh_degree > highest).then(|| {
+            format!(
+                "`init.sh_degree` must be 0 to {highest}, it is {}",
+                self.init.sh_degree
+            )
+        })
     }
 }

@@ -30,8 +30,7 @@ impl History {
     /// Mean total loss over the last `count` steps, if there were any.
     pub fn mean_loss(&self, count: usize) -> Option<f64> {
         let recent = &self.losses[self.losses.len().saturating_sub(count)..];
-        (!recent.is_empty()).then(|| {
-            recent.iter().map(|r| f64::from(r.total)).sum::<f64>() / recent.len() as f64
-        })
+        (!recent.is_empty())
+            .then(|| recent.iter().map(|r| f64::from(r.total)).sum::<f64>() / recent.len() as f64)
     }
 }

@@ -50,8 +50,11 @@ impl LossTerms {
                 Ok(l1(rendered.image(), view.image.clone()))
             })
             .term("d_ssim", ssim_weight, |view, rendered| {
-                let similarity =
-                    ssim(rendered.image(), view.image.clone(), &SsimSettings::default())?;
+                let similarity = ssim(
+                    rendered.image(),
+                    view.image.clone(),
+                    &SsimSettings::default(),
+                )?;
                 Ok(similarity.neg() + 1.0)
             })
     }

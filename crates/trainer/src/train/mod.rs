@@ -218,7 +218,10 @@ fn first_gaussians(
     device: &Device,
 ) -> Result<Gaussians, TrainError> {
     let points = &capture.points;
-    let positions: Vec<_> = points.iter().map(|p| p.position.map(|x| x as f32)).collect();
+    let positions: Vec<_> = points
+        .iter()
+        .map(|p| p.position.map(|x| x as f32))
+        .collect();
     let colors: Vec<_> = points.iter().map(|p| p.color).collect();
     let splats = splats_from_points(&positions, &colors, run.scene_scale, &config.init);
     let splats = splats.map_err(|source| TrainError::Init {
@@ -422,8 +425,11 @@ impl Trainer {
         }
         let tensors = unread.iter().flat_map(|loss| loss.values.clone()).collect();
         let values = Tensor::cat(tensors, 0).into_data().convert::<f32>();
-        let values = values.into_vec::<f32>().unwrap_or_default();
-        for (loss, values) in unread.iter().zip(values.chunks(1 + self.state.history.terms.len())) {
+        let values = values.try_into_vec::<f32>().unwrap_or_default();
+        for (loss, values) in unread
+            .iter()
+            .zip(values.chunks(1 + self.state.history.terms.len()))
+        {
             if !values[0].is_finite() {
                 return Err(TrainError::NotFinite {
                     step: loss.step,
@@ -447,7 +453,13 @@ impl Trainer {
         }
         let settings = self.config.render_settings(SH_DEGREE_MAX);
         let device = self.device.clone().without_autodiff();
-        let scores = evaluate(&self.gaussians.valid(), &held_out, &settings, &device, |_, _| {})?;
+        let scores = evaluate(
+            &self.gaussians.valid(),
+            &held_out,
+            &settings,
+            &device,
+            |_, _| {},
+        )?;
         self.state
             .history
             .held_out_psnr

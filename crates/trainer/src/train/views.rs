@@ -49,7 +49,11 @@ impl ViewOrder {
 
     pub(super) fn at(&mut self, step: usize) -> usize {
         let epoch = step / self.count;
-        if self.epoch.as_ref().is_none_or(|(current, _)| *current != epoch) {
+        if self
+            .epoch
+            .as_ref()
+            .is_none_or(|(current, _)| *current != epoch)
+        {
             let mut order: Vec<usize> = (0..self.count).collect();
             let seed = self.seed ^ (epoch as u64).wrapping_mul(0x9E37_79B9_7F4A_7C15);
             order.shuffle(&mut Pcg64Mcg::seed_from_u64(seed));
