@@ -1,13 +1,8 @@
-//! Swaps the loss: Charbonnier plus the edges' differences instead of L1 + D-SSIM.
-//!
+//! Swaps the loss: Charbonnier plus the edges' differences instead of L1 + D-SSIM. To run it:
 //! `cargo run --release --example swap_loss [CAPTURE [STEPS]]`
 
-use std::path::PathBuf;
-
 use burn::tensor::{Device, Tensor};
-use burn_splat::train::capture::{Capture, CaptureOptions};
-use burn_splat::train::evaluate;
-use burn_splat::train::train::{LossTerms, TrainConfig, Trainer};
+use burn_splat::train::{Capture, CaptureOptions, LossTerms, TrainConfig, Trainer, evaluate};
 
 /// `mean sqrt(difference^2 + eps^2)`: L1 with a round bottom.
 fn charbonnier(difference: Tensor<4>) -> Tensor<1> {
@@ -24,43 +19,41 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args().skip(1);
     let folder = arguments.next().unwrap_or("examples/data/saharov".into());
     let steps = arguments.next().map_or(Ok(300), |steps| steps.parse())?;
-    let capture = Capture::load(&PathBuf::from(folder), &CaptureOptions { downscale: 2 })?;
-    let device = Device::flex();
-
+    let capture = Capture::load(folder.as_ref(), &CaptureOptions { downscale: 2 })?;
+    let config = TrainConfig {
+        steps,
+        ..TrainConfig::default()
+    };
+    let settings = config.render_settings(3);
     let loss = LossTerms::new()
         .term("charbonnier", 0.8, |view, rendered| {
             Ok(charbonnier(rendered.image() - view.image.clone()))
         })
         .term("edges", 0.2, |view, rendered| {
-            let difference = |axis| edges(rendered.image(), axis) - edges(view.image.clone(), axis);
-            Ok(charbonnier(difference(1)) + charbonnier(difference(2)))
+            let along = |axis| edges(rendered.image(), axis) - edges(view.image.clone(), axis);
+            Ok(charbonnier(along(1)) + charbonnier(along(2)))
         });
-    let config = TrainConfig {
-        steps,
-        ..TrainConfig::default()
-    };
     let trained = Trainer::builder()
         .capture(capture.clone())
-        .config(config.clone())
-        .device(device.clone())
+        .config(config)
+        .device(Device::flex())
         .loss(loss)
         .on_progress(|p| match p.history.losses.last() {
-            Some(l) if p.step.is_multiple_of(50) => {
-                println!("step {:5}  {:?} {:?}", p.step, p.history.terms, l.terms)
+            Some(l) if p.step % 50 == 0 => {
+                println!("{:5} {:?} {:?}", p.step, p.history.terms, l.terms)
             }
             _ => {}
         })
         .build()?
         .run()?;
-
-    let held_out: Vec<_> = capture.test_views().collect();
-    let settings = config.render_settings(3);
-    let scores = evaluate(&trained.gaussians, &held_out, &settings, &device, |_, _| {})?;
-    println!(
-        "held out: {:.2} dB PSNR, {:.4} SSIM, {} Gaussians",
-        scores.psnr,
-        scores.ssim,
-        trained.gaussians.len()
-    );
+    let views: Vec<_> = capture.test_views().collect();
+    let scores = evaluate(
+        &trained.gaussians,
+        &views,
+        &settings,
+        &Device::flex(),
+        |_, _| {},
+    )?;
+    println!("held out: {:.2} dB, SSIM {:.4}", scores.psnr, scores.ssim);
     Ok(())
 }

@@ -6,7 +6,7 @@
 //!
 //! ```no_run
 //! use burn_splat::model::{Gaussians, RenderSettings, files, render};
-//! use burn_splat::train::{capture::Capture, train::camera};
+//! use burn_splat::train::{Capture, train::camera};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let device = burn::tensor::Device::flex();

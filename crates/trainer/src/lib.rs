@@ -7,4 +7,6 @@ pub mod gradcheck;
 pub mod report;
 pub mod train;
 
+pub use capture::{Capture, CaptureOptions};
 pub use evaluate::{Scores, ViewScore, evaluate};
+pub use train::{LossTerms, TargetView, TrainConfig, TrainError, Trained, Trainer};
