@@ -10,6 +10,7 @@ mod math;
 mod project;
 mod rasterize;
 mod real;
+mod simd;
 mod spherical_harmonics;
 
 use burn::backend::Flex;

@@ -20,6 +20,7 @@ use rayon::prelude::*;
 use super::buffer::{Buffer, tensor};
 use super::intersect::{Footprint, Grid, TILE, TileLists};
 use super::real::Real;
+use super::simd::vectorized;
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::RasterizeArgs;
 
@@ -249,13 +250,7 @@ pub(super) fn forward<T: Real>(
             .zip(last[pixels].par_chunks_mut(camera.slab()))
             .enumerate()
             .for_each(|(ty, ((image, transmittance), last))| {
-                pulp::Arch::new().dispatch(|| {
-                    for tx in 0..camera.grid.columns {
-                        let (_, splats) = camera_lists.tile(ty * camera.grid.columns + tx);
-                        let tile = ForwardTile::blend(&camera, splats, tx, ty);
-                        tile.store(&camera, tx, ty, image, transmittance, last);
-                    }
-                });
+                blend_row_of_tiles(&camera, &camera_lists, ty, image, transmittance, last);
             });
         lists.push(camera_lists);
     }
@@ -265,6 +260,24 @@ pub(super) fn forward<T: Real>(
         last: Arc::new(last),
     };
     (tensor(image, [c, h, w, d + 1]), state)
+}
+
+vectorized! {
+    /// Renders one row of tiles into its part of the image.
+    fn blend_row_of_tiles<T: Real>(
+        camera: &Camera<T>,
+        lists: &TileLists,
+        ty: usize,
+        image: &mut [T],
+        transmittance: &mut [T],
+        last: &mut [u32],
+    ) {
+        for tx in 0..camera.grid.columns {
+            let (_, splats) = lists.tile(ty * camera.grid.columns + tx);
+            let tile = ForwardTile::blend(camera, splats, tx, ty);
+            tile.store(camera, tx, ty, image, transmittance, last);
+        }
+    }
 }
 
 /// The pixels of a tile while it is being blended.
@@ -306,26 +319,23 @@ impl<T: Real> ForwardTile<T> {
                     continue;
                 }
                 let mut weights = [T::ZERO; TILE];
-                let mut still_open = T::ZERO;
+                let transmittance = &mut tile.transmittance[row];
+                let (last, open) = (&mut tile.last[row], &mut open[row]);
                 for i in 0..TILE {
                     let (_, _, falloff) = splat.falloff(centres[i] - splat.footprint.mean[0], dy);
                     let raw = splat.opacity * falloff;
                     let alpha = thresholds.alpha(raw);
-                    let before = tile.transmittance[row][i];
+                    let before = transmittance[i];
                     let after = before * (T::ONE - alpha);
-                    let seen = thresholds.seen(raw) & (open[row][i] > T::ZERO);
+                    let seen = thresholds.seen(raw) & (open[i] > T::ZERO);
                     let stops = thresholds.stops(after);
                     let blends = seen & !stops;
                     weights[i] = if blends { alpha * before } else { T::ZERO };
-                    tile.transmittance[row][i] = if blends { after } else { before };
-                    tile.last[row][i] = if blends {
-                        place as u32 + 1
-                    } else {
-                        tile.last[row][i]
-                    };
-                    open[row][i] = if seen & stops { T::ZERO } else { open[row][i] };
-                    still_open += open[row][i];
+                    transmittance[i] = if blends { after } else { before };
+                    last[i] = if blends { place as u32 + 1 } else { last[i] };
+                    open[i] = if seen & stops { T::ZERO } else { open[i] };
                 }
+                row_open[row] = any_positive(open);
                 for (lanes, color) in tile.colors[row * d..(row + 1) * d]
                     .iter_mut()
                     .zip(splat.color)
@@ -334,7 +344,6 @@ impl<T: Real> ForwardTile<T> {
                         lanes[i] += *color * weights[i];
                     }
                 }
-                row_open[row] = still_open > T::ZERO;
             }
             if !row_open.contains(&true) {
                 break;
@@ -371,6 +380,16 @@ impl<T: Real> ForwardTile<T> {
             }
         }
     }
+}
+
+/// Integers, because a sum of floats has a fixed order and would not vectorise.
+#[inline(always)]
+fn any_positive<T: Real>(lanes: &Lanes<T>) -> bool {
+    let mut any = 0;
+    for lane in lanes {
+        any |= u32::from(*lane > T::ZERO);
+    }
+    any != 0
 }
 
 /// x of the pixel centres of a tile's row.
@@ -410,20 +429,7 @@ pub(super) fn backward<T: Real>(
         let backgrounds: Vec<Vec<T>> = slabs
             .into_par_iter()
             .enumerate()
-            .map(|(ty, mut partials)| {
-                pulp::Arch::new().dispatch(|| {
-                    let mut background = vec![T::ZERO; d];
-                    for tx in 0..camera.grid.columns {
-                        let (_, splats) = lists.tile(ty * camera.grid.columns + tx);
-                        let (tile, rest) =
-                            core::mem::take(&mut partials).split_at_mut(splats.len() * width);
-                        partials = rest;
-                        BackwardTile::load(&camera, &upstream, tx, ty, &mut background)
-                            .blend(&camera, splats, tx, ty, tile);
-                    }
-                    background
-                })
-            })
+            .map(|(ty, partials)| row_of_tiles_backward(&camera, lists, &upstream, ty, partials))
             .collect();
         for row in backgrounds {
             for (sum, value) in grad_background[index * d..].iter_mut().zip(row) {
@@ -460,6 +466,30 @@ pub(super) fn backward<T: Real>(
         wanted[2].then(|| tensor(column(GEOMETRY - 1, 1), [c, n])),
         wanted[3].then(|| tensor(grad_background, [c, d])),
     ]
+}
+
+vectorized! {
+    /// Writes the partial gradients of one row of tiles; returns its share of the background's.
+    fn row_of_tiles_backward<T: Real>(
+        camera: &Camera<T>,
+        lists: &TileLists,
+        upstream: &Upstream<T>,
+        ty: usize,
+        partials: &mut [T],
+    ) -> Vec<T> {
+        let width = GEOMETRY + camera.channels;
+        let mut partials = partials;
+        let mut background = vec![T::ZERO; camera.channels];
+        for tx in 0..camera.grid.columns {
+            let (_, splats) = lists.tile(ty * camera.grid.columns + tx);
+            let (tile, rest) =
+                core::mem::take(&mut partials).split_at_mut(splats.len() * width);
+            partials = rest;
+            BackwardTile::load(camera, upstream, tx, ty, &mut background)
+                .blend(camera, splats, tx, ty, tile);
+        }
+        background
+    }
 }
 
 /// The part of `partials` that belongs to each row of tiles.
@@ -615,26 +645,27 @@ impl<T: Real> BackwardTile<T> {
                     }
                 }
                 let mut weights = [T::ZERO; TILE];
+                let (transmittance, behind) = (&mut self.transmittance[row], &mut self.behind[row]);
+                let last = &self.last[row];
                 for i in 0..TILE {
                     let dx = centres[i] - splat.footprint.mean[0];
                     let (z1, z2, falloff) = splat.falloff(dx, dy);
                     let raw = splat.opacity * falloff;
                     let alpha = thresholds.alpha(raw);
-                    let blended = thresholds.seen(raw) & (self.last[row][i] > place as u32);
+                    let blended = thresholds.seen(raw) & (last[i] > place as u32);
                     let passes = T::ONE - alpha;
-                    let after = self.transmittance[row][i];
+                    let after = transmittance[i];
                     let before = after / passes;
-                    let behind = self.behind[row][i];
                     let weight = if blended { alpha * before } else { T::ZERO };
-                    let dalpha = before * color_grad[i] - behind / passes;
+                    let dalpha = before * color_grad[i] - behind[i] / passes;
                     let draw = if blended & !thresholds.capped(raw) {
                         dalpha
                     } else {
                         T::ZERO
                     };
                     weights[i] = weight;
-                    self.behind[row][i] = behind + weight * color_grad[i];
-                    self.transmittance[row][i] = if blended { before } else { after };
+                    behind[i] += weight * color_grad[i];
+                    transmittance[i] = if blended { before } else { after };
 
                     let dsigma = -raw * draw;
                     let (dz1, dz2) = (z1 * dsigma, z2 * dsigma);
