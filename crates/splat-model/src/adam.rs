@@ -200,3 +200,74 @@ impl Optimizer for SplatAdam {
         state
     }
 }
+
+#[cfg(all(test, feature = "cpu"))]
+mod tests {
+    use super::*;
+    use burn::optim::AdamConfig;
+
+    fn values(tensor: Tensor<2>) -> Vec<f32> {
+        tensor.into_data().try_into_vec().unwrap()
+    }
+
+    fn gradient(step: usize, device: &Device) -> Tensor<2> {
+        let at = |i: f32| (i * 1.7 + step as f32).sin() * 10f32.powf(i - 2.0);
+        Tensor::from_floats(
+            [[at(0.0), at(1.0)], [at(2.0), at(3.0)], [at(0.5), at(1.5)]],
+            device,
+        )
+    }
+
+    #[test]
+    fn the_numbers_are_those_of_burns_adam() {
+        let device = Device::flex();
+        let theirs = AdamConfig::new().with_epsilon(1e-15).build();
+        let ours = SplatAdam::new(EditLog::default());
+        let start = Tensor::<2>::from_floats([[1.0, -2.0], [0.5, 3.0], [0.0, 0.1]], &device);
+        let (mut a, mut b) = (start.clone(), start);
+        let (mut state_a, mut state_b) = (None, None);
+        for step in 0..50 {
+            (a, state_a) = ours.step(0.01, a, gradient(step, &device), state_a);
+            (b, state_b) = theirs.step(0.01, b, gradient(step, &device), state_b);
+        }
+        for (a, b) in values(a).into_iter().zip(values(b)) {
+            assert!((a - b).abs() <= 1e-6 * b.abs().max(1.0), "{a} {b}");
+        }
+    }
+
+    #[test]
+    fn moments_follow_their_rows_and_new_rows_start_anew() {
+        let device = Device::flex();
+        let log = EditLog::default();
+        let adam = SplatAdam::new(log.clone());
+        let tensor = Tensor::<2>::zeros([3, 2], &device);
+        let (_, state) = adam.step(0.01, tensor.clone(), gradient(0, &device), None);
+        let before = values(state.clone().unwrap().moment_1);
+
+        // Row 0 goes, rows 2 and 1 change places, a copy of row 1 is new.
+        log.push(RowEdit::Gather {
+            source: Tensor::from_ints([2, 1, 1], &device),
+            keep: Tensor::from_floats([1.0, 1.0, 0.0], &device),
+        });
+        assert!(log.is_pending());
+        let nothing = Tensor::<2>::zeros([3, 2], &device);
+        let (_, state) = adam.step(0.01, tensor.clone(), nothing.clone(), state);
+        assert!(!log.is_pending());
+        let expected = [before[4], before[5], before[2], before[3], 0.0, 0.0];
+        for (ours, expected) in values(state.clone().unwrap().moment_1)
+            .into_iter()
+            .zip(expected)
+        {
+            assert!(
+                (ours - 0.9 * expected).abs() <= 1e-7 * expected.abs(),
+                "{ours} {expected}"
+            );
+        }
+
+        log.push(RowEdit::Restart);
+        let (_, state) = adam.step(0.01, tensor, nothing, state);
+        let state = state.unwrap();
+        assert!(values(state.moment_2).iter().all(|moment| *moment == 0.0));
+        assert_eq!((state.edits_seen, log.count()), (2, 2));
+    }
+}

@@ -91,3 +91,111 @@ pub fn ssim(
     let scale = (mean_xx_yy + c1) * (variances + c2);
     Ok((similarity / scale).mean())
 }
+
+#[cfg(all(test, feature = "cpu"))]
+mod tests {
+    use super::*;
+    use burn::tensor::{Device, TensorData};
+    use rand::{RngExt, SeedableRng};
+
+    const SHAPE: [usize; 4] = [2, 19, 23, 3];
+
+    /// Two noisy images of a ramp.
+    fn images() -> [Vec<f64>; 2] {
+        let mut rng = rand_pcg::Pcg64Mcg::seed_from_u64(5);
+        let count = SHAPE.iter().product::<usize>();
+        let mut noisy = || {
+            (0..count)
+                .map(|i| f64::from((i as f32 / count as f32) * 0.7 + rng.random_range(0.0..0.3f32)))
+                .collect()
+        };
+        [noisy(), noisy()]
+    }
+
+    fn tensor(values: &[f64]) -> Tensor<4> {
+        let values: Vec<f32> = values.iter().map(|v| *v as f32).collect();
+        Tensor::from_data(TensorData::new(values, SHAPE), &Device::flex())
+    }
+
+    /// Wang et al. 2004, eq. 13, from its definition: one weighted sum per pixel and moment.
+    fn reference_ssim(x: &[f64], y: &[f64]) -> f64 {
+        let [b, h, w, d] = SHAPE;
+        let weights = SsimSettings::default().weights();
+        let (mut total, mut count) = (0.0, 0);
+        for (image, row, column, channel) in (0..b)
+            .flat_map(|i| (5..h - 5).map(move |r| (i, r)))
+            .flat_map(|(i, r)| (5..w - 5).map(move |c| (i, r, c)))
+            .flat_map(|(i, r, c)| (0..d).map(move |k| (i, r, c, k)))
+        {
+            let mut m = [0.0; 5];
+            for (i, wi) in weights.iter().enumerate() {
+                for (j, wj) in weights.iter().enumerate() {
+                    let at = ((image * h + row + i - 5) * w + column + j - 5) * d + channel;
+                    let moments = [x[at], y[at], x[at] * x[at], y[at] * y[at], x[at] * y[at]];
+                    for (m, moment) in m.iter_mut().zip(moments) {
+                        *m += wi * wj * moment;
+                    }
+                }
+            }
+            let [mx, my, xx, yy, xy] = m;
+            let (c1, c2) = (1e-4, 9e-4);
+            total += (2.0 * mx * my + c1) * (2.0 * (xy - mx * my) + c2)
+                / ((mx * mx + my * my + c1) * (xx - mx * mx + yy - my * my + c2));
+            count += 1;
+        }
+        total / f64::from(count)
+    }
+
+    #[test]
+    fn ssim_agrees_with_its_definition_in_double_precision() {
+        let [x, y] = images();
+        let ours = ssim(tensor(&x), tensor(&y), &SsimSettings::default()).unwrap();
+        let (ours, reference) = (ours.into_scalar::<f32>(), reference_ssim(&x, &y));
+        assert!(
+            (f64::from(ours) - reference).abs() < 2e-6,
+            "{ours} {reference}"
+        );
+        let same = ssim(tensor(&x), tensor(&x), &SsimSettings::default()).unwrap();
+        assert!((same.into_scalar::<f32>() - 1.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn the_gradient_of_ssim_is_that_of_its_definition() {
+        let [x, y] = images();
+        let image = Tensor::from_inner(tensor(&x)).require_grad();
+        let target = Tensor::from_inner(tensor(&y));
+        let loss = ssim(image.clone(), target, &SsimSettings::default()).unwrap();
+        let gradient = image.grad(&loss.backward()).unwrap().into_data();
+        let gradient = gradient.try_into_vec::<f32>().unwrap();
+        let largest = gradient.iter().fold(0.0f32, |m, g| m.max(g.abs()));
+        for at in [0, 300, 700, 1311, 2000] {
+            let step = |delta: f64| {
+                let mut moved = x.clone();
+                moved[at] += delta;
+                reference_ssim(&moved, &y)
+            };
+            let expected = (step(1e-5) - step(-1e-5)) / 2e-5;
+            let error = (f64::from(gradient[at]) - expected).abs() / f64::from(largest);
+            assert!(error < 1e-5, "pixel {at}: {} and {expected}", gradient[at]);
+        }
+    }
+
+    #[test]
+    fn psnr_and_l1_are_what_they_say() {
+        let [x, _] = images();
+        let shifted: Vec<f64> = x.iter().map(|v| v * 0.5 + 0.2).collect();
+        let expected = shifted
+            .iter()
+            .zip(&x)
+            .map(|(a, b)| (a - b).powi(2))
+            .sum::<f64>();
+        let expected = -10.0 * (expected / x.len() as f64).log10();
+        let ours = psnr(tensor(&shifted), tensor(&x)).into_scalar::<f32>();
+        assert!(
+            (f64::from(ours) - expected).abs() < 1e-3,
+            "{ours} {expected}"
+        );
+        let lifted: Vec<f64> = x.iter().map(|v| v + 0.25).collect();
+        assert!((l1(tensor(&lifted), tensor(&x)).into_scalar::<f32>() - 0.25).abs() < 1e-6);
+    }
+}

@@ -17,17 +17,19 @@ use crate::gaussians::host;
 /// The run length that the milestones below are stated for.
 const REFERENCE_STEPS: f64 = 30_000.0;
 
-/// Settings of adaptive density control. Steps are those of a run of 30,000 and scale with it.
+/// Settings of adaptive density control. Milestones are stated for a run of 30,000 steps and shrink
+/// with shorter runs. Intervals do not: statistics need their hundred views, and opacities their
+/// hundreds of steps to recover from a reset, however short the run.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct AdaptiveSettings {
-    /// First step after which rows may be added. Default 500.
+    /// Milestone: rows may be added after this step. Default 500.
     pub start: usize,
-    /// Step after which no more rows are added or removed. Default 15,000.
+    /// Milestone: no rows are added or removed after this step. Default 15,000.
     pub stop: usize,
-    /// Steps between refinements; does not scale. Default 100.
+    /// Interval: steps between refinements. Default 100.
     pub every: usize,
-    /// Steps between opacity resets. Default 3,000.
+    /// Interval: steps between opacity resets. Default 3,000.
     pub reset_every: usize,
     /// A Gaussian is cloned or split when its mean screen gradient exceeds this, in half images.
     /// Default 2e-4.
@@ -36,9 +38,10 @@ pub struct AdaptiveSettings {
     pub split_scale: f64,
     /// Below this opacity a Gaussian is removed. Default 0.005.
     pub prune_opacity: f64,
-    /// Above this share of the scene's scale a Gaussian is removed, once opacities have been reset.
-    /// Default 0.1.
+    /// Above this share of the scene's scale a Gaussian is removed. Default 0.1.
     pub prune_scale: f64,
+    /// Milestone: large Gaussians are removed only after this step. Default 3,000.
+    pub prune_scale_start: usize,
     /// Opacity that a reset leaves. Default 0.01.
     pub reset_opacity: f64,
     /// No growth beyond this many Gaussians. Default: none.
@@ -57,6 +60,7 @@ impl Default for AdaptiveSettings {
             split_scale: 0.01,
             prune_opacity: 0.005,
             prune_scale: 0.1,
+            prune_scale_start: 3_000,
             reset_opacity: 0.01,
             max_gaussians: None,
         }
@@ -175,7 +179,7 @@ impl AdaptiveDensity {
             }
             report = Some(refinement);
         }
-        if step.is_multiple_of(self.run.milestone(self.settings.reset_every))
+        if step.is_multiple_of(self.settings.reset_every)
             && step < self.run.milestone(self.settings.stop)
         {
             gaussians = clamp_opacities(gaussians, self.settings.reset_opacity, logs);
@@ -221,7 +225,7 @@ impl AdaptiveDensity {
         }
         (report.cloned, report.split) = (clones.len(), splits.len());
 
-        let after_reset = step > self.run.milestone(settings.reset_every);
+        let prunes_large = step > self.run.milestone(settings.prune_scale_start);
         let before = plan.source.len();
         let decisions: Vec<bool> = plan
             .source
@@ -231,7 +235,7 @@ impl AdaptiveDensity {
                 let row = *row as usize;
                 let opacity = 1.0 / (1.0 + f64::from(-splats.opacity_logits[row]).exp());
                 let large = scale(row) * f64::from(*offset).exp() > settings.prune_scale;
-                opacity >= settings.prune_opacity && !(after_reset && large)
+                opacity >= settings.prune_opacity && !(prunes_large && large)
             })
             .collect();
         // A model that would lose every row keeps them: nothing could grow back.
@@ -258,5 +262,89 @@ impl AdaptiveDensity {
         } else {
             [0.0; 3]
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const RUN: RunShape = RunShape {
+        steps: 30_000,
+        scene_scale: 2.0,
+        seed: 1,
+    };
+
+    /// Four Gaussians: still, small and growing, large and growing, transparent.
+    fn splats() -> SplatData {
+        SplatData {
+            means: vec![[0.0; 3]; 4],
+            log_scales: [0.01f32, 0.01, 0.1, 0.01].map(|s| [s.ln(); 3]).to_vec(),
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; 4],
+            opacity_logits: vec![0.0, 0.0, 0.0, -6.0],
+            sh0: vec![[0.0; 3]; 4],
+            sh_rest: Vec::new(),
+            sh_degree: 0,
+        }
+    }
+
+    const GRADIENTS: [f64; 4] = [1e-4, 3e-4, 3e-4, 1e-4];
+
+    #[test]
+    fn small_ones_are_cloned_large_ones_split_transparent_ones_pruned() {
+        let density = AdaptiveDensity::new(AdaptiveSettings::default(), RUN);
+        let (plan, report) = density.plan(600, &splats(), &GRADIENTS);
+        assert_eq!((report.cloned, report.split, report.pruned), (1, 1, 1));
+        assert_eq!(plan.source, [0, 1, 1, 2, 2]);
+        assert_eq!(plan.survives, [true, true, false, false, false]);
+        assert!((f64::from(plan.log_scale_offset[3]) + 1.6f64.ln()).abs() < 1e-6);
+        // The halves lie within a few standard deviations, not in one place, and the same next time.
+        assert_ne!(plan.mean_offset[3], plan.mean_offset[4]);
+        assert!(
+            plan.mean_offset[3..]
+                .iter()
+                .flatten()
+                .all(|x| x.abs() < 0.6)
+        );
+        assert_eq!(plan, density.plan(600, &splats(), &GRADIENTS).0);
+    }
+
+    #[test]
+    fn the_cap_stops_growth_and_the_last_ones_stay() {
+        let settings = AdaptiveSettings {
+            max_gaussians: Some(5),
+            prune_opacity: 0.9,
+            ..Default::default()
+        };
+        let density = AdaptiveDensity::new(settings, RUN);
+        let (plan, report) = density.plan(600, &splats(), &GRADIENTS);
+        assert_eq!((report.cloned, report.split, report.pruned), (1, 0, 0));
+        assert_eq!(plan.source.len(), 5);
+    }
+
+    #[test]
+    fn large_ones_are_pruned_only_later() {
+        let mut splats = splats();
+        splats.log_scales[0] = [0.5f32.ln(); 3];
+        let density = AdaptiveDensity::new(AdaptiveSettings::default(), RUN);
+        let pruned = |step| density.plan(step, &splats, &[0.0; 4]).1.pruned;
+        assert_eq!((pruned(600), pruned(3_100)), (1, 2));
+    }
+
+    #[test]
+    fn milestones_shrink_with_the_run() {
+        let run = RunShape {
+            steps: 3_000,
+            ..RUN
+        };
+        assert_eq!(run.milestone(15_000), 1_500);
+        assert_eq!(
+            RunShape {
+                steps: 60_000,
+                ..RUN
+            }
+            .milestone(500),
+            500
+        );
     }
 }

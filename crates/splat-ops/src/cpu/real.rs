@@ -113,9 +113,9 @@ impl Real for f32 {
     }
 }
 
-/// `exp(-sigma)` by range reduction, `2^n e^r` with `|r| <= ln(2) / 2`, and a degree-6 polynomial for
-/// `e^r`. No branch and no library call, so that loops over it vectorise. Measured against f64 on
-/// [0, 16]: relative error below 2.5e-7 (see the test).
+/// `exp(-sigma)` by range reduction, `2^n e^r` with `|r| <= ln(2) / 2`, and the Taylor polynomial
+/// of degree 7 for `e^r` (5e-9 from it). No branch and no library call, so that loops over it
+/// vectorise. Against f64 on [0, 16]: relative error below 2e-7, a rounding or two (see the test).
 #[inline(always)]
 fn exp_neg_f32(sigma: f32) -> f32 {
     // 1.5 * 2^23: adding it rounds to the nearest integer and leaves that integer in the low bits.
@@ -128,7 +128,8 @@ fn exp_neg_f32(sigma: f32) -> f32 {
     let shifted = x * core::f32::consts::LOG2_E + ROUND;
     let n = shifted - ROUND;
     let r = (x - n * LN2_HIGH) - n * LN2_LOW;
-    let mut p = 1.0 / 720.0;
+    let mut p = 1.0 / 5040.0;
+    p = p * r + 1.0 / 720.0;
     p = p * r + 1.0 / 120.0;
     p = p * r + 1.0 / 24.0;
     p = p * r + 1.0 / 6.0;
@@ -152,7 +153,7 @@ mod tests {
             let exact = (-(sigma as f64)).exp();
             worst = worst.max((exp_neg_f32(sigma) as f64 / exact - 1.0).abs());
         }
-        assert!(worst < 2.5e-7, "worst relative error {worst:e}");
+        assert!(worst < 2e-7, "worst relative error {worst:e}");
         assert!(exp_neg_f32(1e9) < 1e-30);
         assert_eq!(exp_neg_f32(0.0), 1.0);
     }

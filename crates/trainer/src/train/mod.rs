@@ -467,3 +467,103 @@ impl Trainer {
         Ok(())
     }
 }
+
+#[cfg(all(test, feature = "cpu"))]
+mod tests {
+    use super::*;
+    use crate::capture::CaptureOptions;
+
+    fn capture() -> Arc<Capture> {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
+        let options = CaptureOptions { downscale: 8 };
+        Arc::new(Capture::load(folder.as_ref(), &options).unwrap())
+    }
+
+    fn builder() -> TrainerBuilder {
+        let config = TrainConfig {
+            steps: 240,
+            ..TrainConfig::default()
+        };
+        Trainer::builder()
+            .capture(capture())
+            .config(config)
+            .device(Device::flex())
+    }
+
+    /// Interrupted after a refinement and resumed from the file, a run ends with the same scene.
+    #[test]
+    fn a_resumed_run_goes_on_as_if_it_had_not_stopped() {
+        let whole = builder().build().unwrap().run().unwrap();
+
+        let flag = Arc::new(AtomicBool::new(false));
+        let raise = flag.clone();
+        let first = builder()
+            .interrupt(flag)
+            .on_progress(move |state| raise.store(state.step >= 130, Ordering::Relaxed))
+            .build()
+            .unwrap()
+            .run()
+            .unwrap();
+        assert_eq!(first.steps, 130);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("checkpoint.safetensors");
+        first.checkpoint.save(&path).unwrap();
+        let checkpoint = Checkpoint::load(&path).unwrap();
+        let second = builder().resume(checkpoint).build().unwrap().run().unwrap();
+
+        assert_eq!(second.steps, 240);
+        assert_eq!(second.history.losses, whole.history.losses);
+        assert!(second.gaussians.to_data() == whole.gaussians.to_data());
+        // Density control must have been part of it.
+        assert_ne!(whole.gaussians.len(), capture().points.len());
+
+        std::fs::write(&path, b"something else").unwrap();
+        let error = Checkpoint::load(&path).unwrap_err().to_string();
+        assert!(error.contains("checkpoint.safetensors"), "{error}");
+    }
+
+    #[test]
+    fn any_closure_is_a_loss_and_its_terms_are_logged_by_name() {
+        let terms = LossTerms::new()
+            .term("far", 0.5, |view, rendered| {
+                Ok((rendered.image() - view.image.clone()).abs().mean())
+            })
+            .term("opaque", 0.25, |_, rendered| Ok(rendered.alpha().mean()));
+        let stop = Arc::new(AtomicBool::new(false));
+        let raise = stop.clone();
+        let trained = builder()
+            .loss(terms)
+            .interrupt(stop)
+            .on_progress(move |state| raise.store(state.step >= 3, Ordering::Relaxed))
+            .build()
+            .unwrap()
+            .run()
+            .unwrap();
+        assert_eq!(trained.history.terms, ["far", "opaque"]);
+        let record = &trained.history.losses[2];
+        let sum = 0.5 * record.terms[0] + 0.25 * record.terms[1];
+        assert!((record.total - sum).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_loss_that_sees_no_picture_or_no_number_is_an_error() {
+        let constant =
+            |view: &TargetView, _: &splat_model::ops::Rendered| Ok(view.image.clone().mean());
+        let error = builder().loss(constant).build().unwrap().run().unwrap_err();
+        assert!(matches!(error, TrainError::Loss(_)), "{error}");
+
+        let not_a_number = |_: &TargetView, rendered: &splat_model::ops::Rendered| {
+            Ok(rendered.image().mean() * f64::NAN)
+        };
+        let error = builder()
+            .loss(not_a_number)
+            .build()
+            .unwrap()
+            .run()
+            .unwrap_err();
+        assert!(
+            matches!(error, TrainError::NotFinite { step: 1, .. }),
+            "{error}"
+        );
+    }
+}

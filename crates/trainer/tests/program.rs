@@ -1,0 +1,190 @@
+//! The `splat` program as its users meet it: what it leaves, that it repeats itself, and what it says to bad input.
+#![cfg(feature = "cpu")]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use tempfile::TempDir;
+
+/// The example capture, in its own folder so that a test may spoil it.
+fn example(into: &Path) -> PathBuf {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
+    let target = into.join("capture");
+    for folder in ["images", "sparse/0"] {
+        fs::create_dir_all(target.join(folder)).unwrap();
+        for entry in fs::read_dir(source.join(folder)).unwrap() {
+            let entry = entry.unwrap();
+            fs::copy(entry.path(), target.join(folder).join(entry.file_name())).unwrap();
+        }
+    }
+    target
+}
+
+fn splat(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_splat"))
+        .args(["--device", "cpu", "--quiet"])
+        .args(arguments)
+        .output()
+        .unwrap()
+}
+
+fn text(path: &Path) -> &str {
+    path.to_str().unwrap()
+}
+
+/// A short training run at a quarter of the size.
+fn train(capture: &Path, out: &Path, more: &[&str]) -> Output {
+    let mut arguments = vec![
+        "train",
+        text(capture),
+        "--out",
+        text(out),
+        "--downscale",
+        "4",
+    ];
+    arguments.extend(more);
+    splat(&arguments)
+}
+
+fn succeed(output: &Output) {
+    let errors = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "{errors}");
+}
+
+#[test]
+fn training_leaves_everything_and_repeats_itself_bit_for_bit() {
+    let folder = TempDir::new().unwrap();
+    let capture = example(folder.path());
+    let outs = ["a", "b", "other_seed"].map(|name| folder.path().join(name));
+    // 300 steps reach the first refinement, so cloning, splitting and pruning are in the comparison.
+    succeed(&train(
+        &capture,
+        &outs[0],
+        &["--steps", "300", "--seed", "7"],
+    ));
+    succeed(&train(
+        &capture,
+        &outs[1],
+        &["--steps", "300", "--seed", "7"],
+    ));
+    succeed(&train(
+        &capture,
+        &outs[2],
+        &["--steps", "300", "--seed", "8"],
+    ));
+
+    let scenes = outs
+        .each_ref()
+        .map(|out| fs::read(out.join("scene.ply")).unwrap());
+    assert!(scenes[0] == scenes[1], "one seed gave two scenes");
+    assert!(scenes[0] != scenes[2], "two seeds gave one scene");
+    for file in ["curves.svg", "config.toml", "views"] {
+        assert!(outs[0].join(file).exists(), "{file} is missing");
+    }
+    let metrics = fs::read(outs[0].join("metrics.json")).unwrap();
+    let metrics: serde_json::Value = serde_json::from_slice(&metrics).unwrap();
+    assert_eq!(metrics["views"].as_array().unwrap().len(), 4);
+    assert_eq!(metrics["steps"], 300);
+    let psnr = metrics["psnr"].as_f64().unwrap();
+    // A scene of the mean colour scores about 12 dB here.
+    assert!(psnr > 17.0, "{psnr} dB");
+
+    let scene = outs[0].join("scene.ply");
+    let evaluated = splat(&["eval", text(&capture), text(&scene), "--downscale", "4"]);
+    succeed(&evaluated);
+    let table = String::from_utf8_lossy(&evaluated.stdout).into_owned();
+    assert!(table.contains(&format!("{psnr:.3}")), "{table}");
+    succeed(&splat(&["info", text(&scene)]));
+    succeed(&splat(&["info", text(&capture)]));
+}
+
+/// Bad input: exit status 2, one line that holds these words, and no output folder.
+fn refused(output: &Output, out: &Path, words: &[&str]) {
+    let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert_eq!(output.status.code(), Some(2), "{errors}");
+    assert_eq!(errors.trim_end().lines().count(), 1, "{errors}");
+    for word in words {
+        assert!(errors.contains(word), "`{word}` is not in: {errors}");
+    }
+    assert!(!out.exists(), "something was written");
+}
+
+#[test]
+fn bad_captures_are_refused_in_one_line() {
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("out");
+    let missing = folder.path().join("nowhere");
+    refused(&train(&missing, &out, &[]), &out, &["nowhere"]);
+
+    let capture = example(folder.path());
+    let model = capture.join("sparse/0/images.bin");
+    let whole = fs::read(&model).unwrap();
+    fs::write(&model, &whole[..whole.len() / 2]).unwrap();
+    refused(&train(&capture, &out, &[]), &out, &["images.bin"]);
+    fs::write(&model, &whole).unwrap();
+
+    let photos: Vec<_> = fs::read_dir(capture.join("images")).unwrap().collect();
+    let photo = photos[3].as_ref().unwrap().path();
+    let kept = fs::read(&photo).unwrap();
+    fs::remove_file(&photo).unwrap();
+    let name = photo.file_name().unwrap().to_str().unwrap();
+    refused(&train(&capture, &out, &[]), &out, &[name]);
+    fs::write(&photo, kept).unwrap();
+
+    let points = capture.join("sparse/0/points3D.bin");
+    let kept = fs::read(&points).unwrap();
+    fs::write(&points, 0u64.to_le_bytes()).unwrap();
+    refused(
+        &train(&capture, &out, &[]),
+        &out,
+        &["points3D.bin", "point"],
+    );
+    fs::write(&points, kept).unwrap();
+
+    // At 1 x 1 pixel there is nothing to compare.
+    let tiny = splat(&[
+        "train",
+        text(&capture),
+        "--out",
+        text(&out),
+        "--downscale",
+        "317",
+    ]);
+    refused(&tiny, &out, &["1x1"]);
+    refused(&train(&capture, &out, &["--steps", "0"]), &out, &["steps"]);
+    refused(
+        &train(&capture, &out, &["--sh-degree", "4"]),
+        &out,
+        &["sh_degree"],
+    );
+}
+
+#[test]
+fn bad_scenes_are_refused_in_one_line() {
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("out");
+    let scene = folder.path().join("nan.ply");
+    let properties = [
+        "x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
+        "rot_0", "rot_1", "rot_2", "rot_3",
+    ];
+    let header: String = properties
+        .iter()
+        .map(|p| format!("property float {p}\n"))
+        .collect();
+    let row = |x: &str| format!("{x} 0 0 0 0 0 0 0 0 0 1 0 0 0\n");
+    let file = format!(
+        "ply\nformat ascii 1.0\nelement vertex 2\n{header}end_header\n{}{}",
+        row("1"),
+        row("nan")
+    );
+    fs::write(&scene, file).unwrap();
+    refused(
+        &splat(&["info", text(&scene)]),
+        &out,
+        &["nan.ply", "1", "x"],
+    );
+    fs::write(&scene, "no splats here").unwrap();
+    refused(&splat(&["info", text(&scene)]), &out, &["nan.ply"]);
+}
