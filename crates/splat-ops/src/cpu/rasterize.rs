@@ -340,8 +340,10 @@ impl<T: Real> ForwardTile<T> {
                     .iter_mut()
                     .zip(splat.color)
                 {
+                    // A copy: through the reference it might alias the lanes, which bars SIMD.
+                    let color = *color;
                     for i in 0..TILE {
-                        lanes[i] += *color * weights[i];
+                        lanes[i] += color * weights[i];
                     }
                 }
             }
