@@ -12,6 +12,7 @@ use burn::tensor::{Device, Int, Tensor};
 
 /// What happened to the rows of a parameter.
 #[derive(Debug, Clone)]
+#[expect(clippy::large_enum_variant, reason = "a handful exist at a time")]
 pub enum RowEdit {
     /// Row i of the new parameter continues row `source[i]` of the old one where `keep[i]` is one;
     /// where it is zero its moments start anew.

@@ -10,7 +10,7 @@
 //! `f_rest_*` runs over the coefficients of red, then of green, then of blue (channel-major; in [`SplatData`] it is
 //! coefficient-major). The normals are written as 0 and not read.
 //!
-//! [`write`] writes binary little endian. [`read`] also takes ASCII and big endian, properties in any order and of any
+//! [`write()`] writes binary little endian. [`read()`] also takes ASCII and big endian, properties in any order and of any
 //! number type (such as `double`), and ignores properties and elements it does not know.
 
 use std::cell::Cell;

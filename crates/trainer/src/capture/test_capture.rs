@@ -6,12 +6,14 @@ use std::path::Path;
 
 use super::Point;
 
+/// (id, quaternion, translation, camera id, name).
+type Image = (u32, [f64; 4], [f64; 3], u32, String);
+
 /// What to write; [`TestCapture::new`] gives a good one and the tests spoil it.
 pub(super) struct TestCapture {
     /// (id, model number, width, height, parameters).
     pub cameras: Vec<(u32, i32, u64, u64, Vec<f64>)>,
-    /// (id, quaternion, translation, camera id, name).
-    pub images: Vec<(u32, [f64; 4], [f64; 3], u32, String)>,
+    pub images: Vec<Image>,
     /// (id, point).
     pub points: Vec<(u64, Point)>,
 }

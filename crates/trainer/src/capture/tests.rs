@@ -381,7 +381,8 @@ fn message_after(file: &str, spoil: impl FnOnce(&mut TestCapture)) -> String {
 
 #[test]
 fn nonsense_in_a_record_is_named() {
-    let cases: [(&str, &str, fn(&mut TestCapture)); 11] = [
+    type Case = (&'static str, &'static str, fn(&mut TestCapture));
+    let cases: [Case; 11] = [
         ("points3D.bin", "point 3", |m| {
             m.points[3].1.position[1] = f64::INFINITY;
         }),
