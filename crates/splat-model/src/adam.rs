@@ -9,6 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use burn::optim::{LearningRate, Optimizer, RecordState, StateSink, StateSource};
 use burn::tensor::{Device, Int, Tensor};
+use splat_ops::{AdamStep, adam_step};
 
 /// What happened to the rows of a parameter.
 #[derive(Debug, Clone)]
@@ -187,12 +188,18 @@ impl Optimizer for SplatAdam {
         let correction_1 = 1.0 - self.beta_1.powf(time);
         let correction_2 = (1.0 - self.beta_2.powf(time)).sqrt();
 
-        state.moment_1 = state.moment_1 * self.beta_1 + grad.clone() * (1.0 - self.beta_1);
-        state.moment_2 = state.moment_2 * self.beta_2 + grad.square() * (1.0 - self.beta_2);
         // m / c1 / (sqrt(v) / c2 + eps) = (c2 / c1) m / (sqrt(v) + c2 eps)
-        let root = state.moment_2.clone().sqrt() + correction_2 * self.epsilon;
-        let delta = state.moment_1.clone() / root * (lr * correction_2 / correction_1);
-        (tensor - delta, Some(state))
+        let step = AdamStep {
+            beta_1: self.beta_1,
+            beta_2: self.beta_2,
+            rate: lr * correction_2 / correction_1,
+            epsilon: self.epsilon * correction_2,
+        };
+        let moments = [state.moment_1, state.moment_2];
+        let (tensor, [moment_1, moment_2]) = adam_step(tensor, grad, moments, &step);
+        state.moment_1 = moment_1;
+        state.moment_2 = moment_2;
+        (tensor, Some(state))
     }
 
     fn to_device<const D: usize>(mut state: Self::State<D>, device: &Device) -> Self::State<D> {

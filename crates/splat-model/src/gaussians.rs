@@ -106,9 +106,12 @@ impl Gaussians {
         let count = sh_coefficient_count(degree) - 1;
         match &self.sh_rest {
             Some(rest) if count > 0 => {
-                let rest = rest.val();
-                let count = count.min(rest.dims()[1]);
-                Tensor::cat(vec![self.sh0.val(), rest.narrow(1, 0, count)], 1)
+                let mut rest = rest.val();
+                // All of them: no slice, whose gradient would be padded with zeros.
+                if count < rest.dims()[1] {
+                    rest = rest.narrow(1, 0, count);
+                }
+                Tensor::cat(vec![self.sh0.val(), rest], 1)
             }
             _ => self.sh0.val(),
         }

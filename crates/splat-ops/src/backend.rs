@@ -8,6 +8,7 @@ use burn::backend::{Backend, ExtensionType, backend_extension, tensor::FloatTens
 #[allow(unused_imports)]
 use burn::backend::{Autodiff, Dispatch};
 
+use crate::adam::AdamStep;
 use crate::settings::{ProjectArgs, RasterizeArgs};
 
 /// Floats per splat in the packed output of `project`:
@@ -89,6 +90,34 @@ pub trait SplatBackend: Backend {
     /// Convolves rows and columns of `[B, H, W, D]` with a symmetric window of odd length, zeros
     /// outside. Linear and self-adjoint: its own vector-Jacobian product.
     fn gaussian_blur(image: FloatTensor<Self>, window: &[f64]) -> FloatTensor<Self>;
+
+    /// Parameter, gradient and both moments to parameter and moments after
+    /// [`adam_step`](crate::adam_step). Composed of tensor ops unless a backend knows better.
+    fn adam(tensors: [FloatTensor<Self>; 4], step: &AdamStep) -> [FloatTensor<Self>; 3] {
+        let [param, grad, moment_1, moment_2] = tensors;
+        let decay = |moment, beta: f64, fresh| {
+            Self::float_add(
+                Self::float_mul_scalar(moment, beta.into()),
+                Self::float_mul_scalar(fresh, (1.0 - beta).into()),
+            )
+        };
+        let square = Self::float_mul(grad.clone(), grad.clone());
+        let moment_1 = decay(moment_1, step.beta_1, grad);
+        let moment_2 = decay(moment_2, step.beta_2, square);
+        let root = Self::float_sqrt(moment_2.clone());
+        let root = Self::float_add_scalar(root, step.epsilon.into());
+        let delta = Self::float_div(moment_1.clone(), root);
+        let delta = Self::float_mul_scalar(delta, step.rate.into());
+        [Self::float_sub(param, delta), moment_1, moment_2]
+    }
+}
+
+/// A parameter and its moments, in the form in which Burn's dispatch can carry them.
+#[derive(ExtensionType)]
+pub(crate) struct AdamTensors<B: Backend> {
+    pub(crate) param: FloatTensor<B>,
+    pub(crate) moment_1: FloatTensor<B>,
+    pub(crate) moment_2: FloatTensor<B>,
 }
 
 /// An optional tensor, in the form in which Burn's dispatch can carry one.
@@ -127,6 +156,14 @@ pub(crate) trait SplatOps: Backend {
     ) -> FloatTensor<Self>;
 
     fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self>;
+
+    fn adam(
+        param: FloatTensor<Self>,
+        grad: FloatTensor<Self>,
+        moment_1: FloatTensor<Self>,
+        moment_2: FloatTensor<Self>,
+        step: AdamStep,
+    ) -> AdamTensors<Self>;
 }
 
 /// Without autodiff an op is its forward, and nothing is kept.
@@ -168,6 +205,22 @@ macro_rules! forward_only {
 
             fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self> {
                 <Self as SplatBackend>::gaussian_blur(image, &window)
+            }
+
+            fn adam(
+                param: FloatTensor<Self>,
+                grad: FloatTensor<Self>,
+                moment_1: FloatTensor<Self>,
+                moment_2: FloatTensor<Self>,
+                step: AdamStep,
+            ) -> AdamTensors<Self> {
+                let [param, moment_1, moment_2] =
+                    <Self as SplatBackend>::adam([param, grad, moment_1, moment_2], &step);
+                AdamTensors {
+                    param,
+                    moment_1,
+                    moment_2,
+                }
             }
         }
     };

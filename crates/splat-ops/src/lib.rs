@@ -22,6 +22,7 @@
 pub mod backend;
 pub mod settings;
 
+mod adam;
 mod autodiff;
 mod blur;
 mod check;
@@ -34,6 +35,7 @@ mod project;
 mod rasterize;
 mod spherical_harmonics;
 
+pub use adam::{AdamStep, adam_step};
 pub use blur::gaussian_blur;
 pub use error::OpError;
 pub use project::{Projected, project};

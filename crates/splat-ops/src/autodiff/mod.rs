@@ -10,9 +10,10 @@ mod spherical_harmonics;
 use burn::backend::autodiff::NodeId;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
-use burn::backend::{Autodiff, tensor::FloatTensor};
+use burn::backend::{Autodiff, AutodiffBackend, tensor::FloatTensor};
 
-use crate::backend::{Background, SplatBackend, SplatOps};
+use crate::adam::AdamStep;
+use crate::backend::{AdamTensors, Background, SplatBackend, SplatOps};
 use crate::settings::{ProjectArgs, RasterizeArgs};
 
 impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
@@ -47,6 +48,23 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
 
     fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self> {
         blur::gaussian_blur::<B, C>(image, window)
+    }
+
+    /// An optimiser's step is no part of any graph: what comes out is new leaves.
+    fn adam(
+        param: FloatTensor<Self>,
+        grad: FloatTensor<Self>,
+        moment_1: FloatTensor<Self>,
+        moment_2: FloatTensor<Self>,
+        step: AdamStep,
+    ) -> AdamTensors<Self> {
+        let tensors = [param, grad, moment_1, moment_2].map(|tensor| tensor.into_primitive());
+        let [param, moment_1, moment_2] = B::adam(tensors, &step).map(Self::from_inner);
+        AdamTensors {
+            param,
+            moment_1,
+            moment_2,
+        }
     }
 }
 

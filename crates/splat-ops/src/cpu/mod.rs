@@ -3,6 +3,7 @@
 //! Parallel over Gaussians or rows of tiles with rayon, and deterministic: whatever is summed across
 //! threads is summed in a fixed order, so the same input gives the same bits on any number of threads.
 
+mod adam;
 mod blur;
 mod buffer;
 mod intersect;
@@ -17,6 +18,7 @@ use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use burn::tensor::DType;
 
+use crate::adam::AdamStep;
 use crate::backend::SplatBackend;
 use crate::settings::{ProjectArgs, RasterizeArgs};
 
@@ -136,5 +138,9 @@ impl SplatBackend for Flex {
 
     fn gaussian_blur(image: FlexTensor, window: &[f64]) -> FlexTensor {
         in_precision!(image, blur::blur, image, window)
+    }
+
+    fn adam(tensors: [FlexTensor; 4], step: &AdamStep) -> [FlexTensor; 3] {
+        in_precision!(tensors[0], adam::step, tensors, step)
     }
 }

@@ -1,0 +1,48 @@
+//! One step of Adam (Kingma & Ba 2015) on one parameter: the arithmetic, without any state.
+
+use burn::backend::Dispatch;
+use burn::tensor::Tensor;
+
+use crate::backend::SplatOps;
+
+/// The numbers of one step; the bias corrections are already in `rate` and `epsilon`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdamStep {
+    /// Decay of the first moment.
+    pub beta_1: f64,
+    /// Decay of the second moment.
+    pub beta_2: f64,
+    /// Learning rate times `sqrt(1 - beta_2^t) / (1 - beta_1^t)`.
+    pub rate: f64,
+    /// Added to the root of the second moment; epsilon times `sqrt(1 - beta_2^t)`.
+    pub epsilon: f64,
+}
+
+/// Steps a parameter and its two moments, all of one shape:
+/// `m = beta_1 m + (1 - beta_1) g`, `v = beta_2 v + (1 - beta_2) g^2`,
+/// `p = p - rate m / (sqrt(v) + epsilon)`. One pass over memory on the CPU. Not differentiable.
+///
+/// # Panics
+/// Where the shapes differ.
+pub fn adam_step<const D: usize>(
+    param: Tensor<D>,
+    grad: Tensor<D>,
+    moments: [Tensor<D>; 2],
+    step: &AdamStep,
+) -> (Tensor<D>, [Tensor<D>; 2]) {
+    let [moment_1, moment_2] = moments;
+    for other in [&grad, &moment_1, &moment_2] {
+        assert_eq!(param.dims(), other.dims(), "adam_step: shapes differ");
+    }
+    let stepped = <Dispatch as SplatOps>::adam(
+        param.into_dispatch(),
+        grad.into_dispatch(),
+        moment_1.into_dispatch(),
+        moment_2.into_dispatch(),
+        *step,
+    );
+    (
+        Tensor::from_dispatch(stepped.param),
+        [stepped.moment_1, stepped.moment_2].map(Tensor::from_dispatch),
+    )
+}
