@@ -23,7 +23,8 @@ const REFERENCE_STEPS: f64 = 30_000.0;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct AdaptiveSettings {
-    /// Milestone: rows may be added after this step. Default 500.
+    /// Rows may be added after this step, or after a quarter of the run where that is sooner: before,
+    /// gradients are those of a scene that has not formed yet. Default 500.
     pub start: usize,
     /// Milestone: no rows are added or removed after this step. Default 15,000.
     pub stop: usize,
@@ -166,7 +167,8 @@ impl AdaptiveDensity {
             return (gaussians, None);
         }
         let mut report = None;
-        let due = step > self.run.milestone(settings.start) && step.is_multiple_of(settings.every);
+        let start = settings.start.min(self.run.steps / 4);
+        let due = step > start && step.is_multiple_of(settings.every);
         if due && let Some((total, views)) = self.statistics.take() {
             let gradients: Vec<f64> = host(total)
                 .into_iter()
