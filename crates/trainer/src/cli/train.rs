@@ -146,8 +146,9 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         .evaluate_every(config.steps.div_ceil(MEASUREMENTS))
         .on_progress(move |state| {
             shown.borrow_mut().update(state.step as u64, || {
-                let loss = state.history.mean_loss(LOSS_WINDOW).unwrap_or(f64::NAN);
-                format!("loss {loss:.4}  {} Gaussians", state.gaussians)
+                let loss = state.history.mean_loss(LOSS_WINDOW);
+                let loss = loss.map_or_else(String::new, |loss| format!("loss {loss:.4}  "));
+                format!("{loss}{} Gaussians", state.gaussians)
             });
         });
     if let Some(checkpoint) = checkpoint {
