@@ -14,12 +14,13 @@ use super::device::ChosenDevice;
 use super::{Failure, GlobalArgs, device, eval, interrupt, print, scene};
 use crate::capture::{Capture, CaptureOptions, View};
 use crate::report::curves::Curves;
+use crate::report::losses::write_losses;
 use crate::report::memory::peak_rss_bytes;
 use crate::report::metrics::{Metrics, write_json};
 use crate::report::png::Picture;
 use crate::report::progress::Progress;
 use crate::report::{ReportError, write_atomically};
-use crate::train::{Checkpoint, History, TrainConfig, Trained, Trainer};
+use crate::train::{Checkpoint, CheckpointError, History, TrainConfig, Trained, Trainer};
 use crate::{Scores, evaluate};
 
 /// The held-out views are measured this many times during a run, for the curves.
@@ -28,6 +29,8 @@ const MEASUREMENTS: usize = 10;
 const LOSS_WINDOW: usize = 50;
 /// Name of the checkpoint in a run's folder.
 const CHECKPOINT: &str = "checkpoint.safetensors";
+/// A crash loses no more than this much training.
+const AUTOSAVE: Duration = Duration::from_secs(60);
 
 /// Train a scene from photos
 #[derive(Debug, Args)]
@@ -36,8 +39,9 @@ const CHECKPOINT: &str = "checkpoint.safetensors";
   splat train photos/ --downscale 2 --steps 7000 --out out/garden
   splat train photos/ --resume out/garden
 
-Writes to DIR: scene.ply, metrics.json, config.toml, curves.svg and views/*.png (truth beside render).
-Ctrl-C finishes the step and writes a checkpoint to resume from; a second Ctrl-C ends at once.")]
+Writes to DIR: scene.ply, metrics.json, config.toml, curves.svg, losses.csv and views/*.png (truth
+beside render). Ctrl-C finishes the step and writes a checkpoint to resume from; a second Ctrl-C ends
+at once. A checkpoint is also written every minute, so that --resume goes on after a crash.")]
 pub struct TrainArgs {
     /// Capture: a folder with `images/` and `sparse/0/`
     pub capture: PathBuf,
@@ -133,6 +137,25 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     let config_path = out.join("config.toml");
     let config_text = config_text(&config_path, args, &chosen, &config)?;
 
+    let checkpoint_path = out.join(CHECKPOINT);
+    let save = {
+        let (path, config_path, text) = (
+            checkpoint_path.clone(),
+            config_path.clone(),
+            config_text.clone(),
+        );
+        move |checkpoint: &Checkpoint| {
+            // The settings first: a checkpoint is of no use without them.
+            write_atomically(&config_path, text.as_bytes()).map_err(|source| {
+                CheckpointError::Io {
+                    path: config_path.clone(),
+                    source,
+                }
+            })?;
+            checkpoint.save(&path)
+        }
+    };
+
     let done = checkpoint.as_ref().map_or(0, Checkpoint::step);
     let progress = Progress::new(config.steps as u64, done as u64, global.quiet);
     let progress = Rc::new(RefCell::new(progress));
@@ -144,6 +167,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         .device(chosen.device.clone())
         .interrupt(interrupt::flag()?)
         .evaluate_every(config.steps.div_ceil(MEASUREMENTS))
+        .autosave(AUTOSAVE, save.clone())
         .on_progress(move |state| {
             shown.borrow_mut().update(state.step as u64, || {
                 let loss = state.history.mean_loss(LOSS_WINDOW);
@@ -158,12 +182,9 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     progress.borrow().finish();
     let trained = trained?;
 
-    write_atomically(&config_path, config_text.as_bytes()).map_err(|source| ReportError::Io {
-        path: config_path,
-        source,
-    })?;
+    // Before the rest, so that nothing is lost should the rest fail.
+    save(&trained.checkpoint)?;
     if trained.steps < config.steps {
-        trained.checkpoint.save(&out.join(CHECKPOINT))?;
         global.say(format_args!(
             "stopped after {} of {} steps; to go on: splat train {} --resume {}",
             trained.steps,
@@ -174,6 +195,10 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         return Ok(());
     }
     let scores = finish(&out, &capture, &config, &chosen, &trained)?;
+    std::fs::remove_file(&checkpoint_path).map_err(|source| ReportError::Io {
+        path: checkpoint_path,
+        source,
+    })?;
     if !scores.views.is_empty() {
         print(&eval::table(&scores));
     }
@@ -214,6 +239,7 @@ fn finish(
 ) -> Result<Scores, Failure> {
     ply::write(&out.join("scene.ply"), &trained.gaussians.to_data())?;
     curves(&trained.history).write(&out.join("curves.svg"))?;
+    write_losses(&out.join("losses.csv"), &trained.history)?;
 
     let views: Vec<&View> = capture.test_views().collect();
     let settings = config.render_settings(SH_DEGREE_MAX);

@@ -5,6 +5,7 @@
 
 mod atomic;
 pub mod curves;
+pub mod losses;
 pub mod memory;
 pub mod metrics;
 pub mod png;

@@ -190,6 +190,7 @@ impl Checkpoint {
                 .collect();
             tensors.push((name, view.shape().to_vec(), values));
         }
+        check_shapes(&tensors).map_err(format)?;
         Ok(Self {
             path: path.to_path_buf(),
             meta,
@@ -278,6 +279,30 @@ impl Checkpoint {
     }
 }
 
+/// What does not fit together, if anything: every tensor has a row per Gaussian, of the width of its name.
+fn check_shapes(tensors: &[(String, Vec<usize>, Vec<f32>)]) -> Result<(), String> {
+    let means = tensors.iter().find(|(name, ..)| name == "means");
+    let n = match means.map(|(_, shape, _)| shape.as_slice()) {
+        Some([n, 3]) => *n,
+        _ => return Err("tensor `means` of shape [N, 3] is missing".into()),
+    };
+    for (name, shape, _) in tensors {
+        let fits = match (name.as_str(), shape.as_slice()) {
+            ("means" | "log_scales", [rows, 3]) | ("quats", [rows, 4]) => *rows == n,
+            ("opacity_logits" | "density.gradients" | "density.views", [rows]) => *rows == n,
+            ("sh0", [rows, 1, 3]) => *rows == n,
+            ("sh_rest", [rows, 3 | 8 | 15, 3]) => *rows == n,
+            _ => false,
+        };
+        if !fits {
+            return Err(format!(
+                "tensor `{name}` has shape {shape:?} beside {n} means"
+            ));
+        }
+    }
+    Ok(())
+}
+
 fn param_ids(gaussians: &Gaussians) -> Vec<(String, String)> {
     let mut ids = vec![
         ("means", gaussians.means.id),
@@ -295,4 +320,17 @@ fn param_ids(gaussians: &Gaussians) -> Vec<(String, String)> {
     ids.into_iter()
         .map(|(name, id)| (name.to_owned(), id.val().to_string()))
         .collect()
+}
+
+#[cfg(test)]
+impl Checkpoint {
+    /// Damages a tensor, for tests.
+    pub(super) fn drop_row(&mut self, name: &str) {
+        for (found, shape, values) in &mut self.tensors {
+            if found == name {
+                shape[0] -= 1;
+                values.truncate(shape.iter().product());
+            }
+        }
+    }
 }

@@ -111,8 +111,19 @@ pub struct TrainerBuilder {
     interrupt: Arc<AtomicBool>,
     resume: Option<Checkpoint>,
     evaluate_every: Option<usize>,
+    autosave: Option<Autosave>,
     on_progress: Box<dyn FnMut(Progress)>,
 }
+
+/// Keeps the state of a run from time to time.
+struct Autosave {
+    every: Duration,
+    last: Instant,
+    save: Box<SaveCheckpoint>,
+}
+
+/// Puts a checkpoint where it outlives the process.
+type SaveCheckpoint = dyn FnMut(&Checkpoint) -> Result<(), CheckpointError>;
 
 impl TrainerBuilder {
     /// The photos to train on.
@@ -155,6 +166,20 @@ impl TrainerBuilder {
     /// Measures held-out PSNR every so many steps, for the curves. Default: never.
     pub fn evaluate_every(mut self, steps: usize) -> Self {
         self.evaluate_every = Some(steps.max(1));
+        self
+    }
+
+    /// Calls `save` every so often, so that a crash loses no more than that much time. Default: never.
+    pub fn autosave(
+        mut self,
+        every: Duration,
+        save: impl FnMut(&Checkpoint) -> Result<(), CheckpointError> + 'static,
+    ) -> Self {
+        self.autosave = Some(Autosave {
+            every,
+            last: Instant::now(),
+            save: Box::new(save),
+        });
         self
     }
 
@@ -203,6 +228,7 @@ impl TrainerBuilder {
             run,
             interrupt: self.interrupt,
             evaluate_every: self.evaluate_every,
+            autosave: self.autosave,
             on_progress: self.on_progress,
             gaussians,
             state,
@@ -277,6 +303,7 @@ pub struct Trainer {
     views: views::ViewOrder,
     interrupt: Arc<AtomicBool>,
     evaluate_every: Option<usize>,
+    autosave: Option<Autosave>,
     on_progress: Box<dyn FnMut(Progress)>,
     gaussians: Gaussians,
     state: State,
@@ -294,6 +321,7 @@ impl Trainer {
             interrupt: Arc::default(),
             resume: None,
             evaluate_every: None,
+            autosave: None,
             on_progress: Box::new(|_| {}),
         }
     }
@@ -301,7 +329,7 @@ impl Trainer {
     /// Runs to the last step, or until interrupted.
     ///
     /// # Errors
-    /// When the loss stops being a number, or an op refuses what it is given.
+    /// When the loss stops being a number, an op refuses what it is given, or a checkpoint cannot be kept.
     pub fn run(mut self) -> Result<Trained, TrainError> {
         while self.state.step < self.config.steps && !self.should_stop() {
             let start = Instant::now();
@@ -317,6 +345,7 @@ impl Trainer {
             {
                 self.measure_held_out()?;
             }
+            self.save_if_due()?;
             (self.on_progress)(Progress {
                 step: self.state.step,
                 steps: self.config.steps,
@@ -334,10 +363,29 @@ impl Trainer {
         })
     }
 
-    /// Interrupted, and at a point that a checkpoint can hold: the means' moments, which are stepped
-    /// with all others, have followed every edit.
     fn should_stop(&self) -> bool {
-        self.interrupt.load(Ordering::Relaxed) && !self.state.edits[0].is_pending()
+        self.interrupt.load(Ordering::Relaxed) && self.is_at_rest()
+    }
+
+    /// At a point that a checkpoint can hold: the means' moments, which are stepped with all others,
+    /// have followed every edit.
+    fn is_at_rest(&self) -> bool {
+        !self.state.edits[0].is_pending()
+    }
+
+    fn save_if_due(&mut self) -> Result<(), TrainError> {
+        let due = |autosave: &Autosave| autosave.last.elapsed() >= autosave.every;
+        if !self.autosave.as_ref().is_some_and(due) || !self.is_at_rest() {
+            return Ok(());
+        }
+        // A run whose loss is no longer a number ends here, and the last good checkpoint stays.
+        self.read_losses()?;
+        let checkpoint = Checkpoint::of(&self.gaussians, &self.state)?;
+        if let Some(autosave) = &mut self.autosave {
+            (autosave.save)(&checkpoint)?;
+            autosave.last = Instant::now();
+        }
+        Ok(())
     }
 
     fn step(&mut self) -> Result<(), TrainError> {
@@ -470,6 +518,9 @@ impl Trainer {
 
 #[cfg(all(test, feature = "cpu"))]
 mod tests {
+    use std::cell::RefCell;
+    use std::rc::Rc;
+
     use super::*;
     use crate::capture::CaptureOptions;
 
@@ -517,9 +568,38 @@ mod tests {
         // Density control must have been part of it.
         assert_ne!(whole.gaussians.len(), capture().points.len());
 
+        let mut damaged = first.checkpoint.clone();
+        damaged.drop_row("quats");
+        damaged.save(&path).unwrap();
+        let error = Checkpoint::load(&path).unwrap_err().to_string();
+        assert!(error.contains("`quats` has shape"), "{error}");
+
         std::fs::write(&path, b"something else").unwrap();
         let error = Checkpoint::load(&path).unwrap_err().to_string();
         assert!(error.contains("checkpoint.safetensors"), "{error}");
+    }
+
+    /// What an autosave kept is where a killed run goes on from, to the same end.
+    #[test]
+    fn a_killed_run_goes_on_from_its_last_autosave() {
+        let kept = Rc::new(RefCell::new(Vec::new()));
+        let keep = kept.clone();
+        let whole = builder()
+            .autosave(Duration::ZERO, move |checkpoint| {
+                keep.borrow_mut().push(checkpoint.clone());
+                Ok(())
+            })
+            .build()
+            .unwrap()
+            .run()
+            .unwrap();
+        let kept = kept.borrow();
+        assert!(kept.len() > 200, "{} checkpoints", kept.len());
+        let checkpoint = kept[kept.len() - 30].clone();
+        assert!(checkpoint.step() < 240);
+        let resumed = builder().resume(checkpoint).build().unwrap().run().unwrap();
+        assert_eq!(resumed.history.losses, whole.history.losses);
+        assert!(resumed.gaussians.to_data() == whole.gaussians.to_data());
     }
 
     #[test]
