@@ -150,14 +150,6 @@ impl Capture {
 }
 
 impl View {
-    /// The camera's centre in the world, `-R^T t`.
-    pub fn center(&self) -> [f64; 3] {
-        let m = &self.viewmat;
-        std::array::from_fn(|axis| {
-            -(m[0][axis] * m[0][3] + m[1][axis] * m[1][3] + m[2][axis] * m[2][3])
-        })
-    }
-
     /// Where a world point falls in the photo, `(x, y)` in pixels, and its depth along the camera's axis. Points at
     /// depth 0 have no finite place.
     pub fn project(&self, point: [f64; 3]) -> ([f64; 2], f64) {

@@ -130,7 +130,7 @@ fn quaternions_are_normalised_and_poses_kept() {
             .unwrap();
         assert_eq!([m[0][3], m[1][3], m[2][3]], *translation);
         // The centre is what the camera maps to its origin.
-        let center = view.center();
+        let center = crate::train::camera(view).position().to_array();
         for row in &m[..3] {
             let mapped = row[0] * center[0] + row[1] * center[1] + row[2] * center[2] + row[3];
             assert!(mapped.abs() < 1e-14);

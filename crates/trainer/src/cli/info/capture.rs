@@ -5,6 +5,7 @@ use std::fmt::Write;
 use super::scene::middle;
 use super::{bounds, bounds_text};
 use crate::capture::Capture;
+use crate::train::camera;
 
 /// Describes the capture.
 pub(super) fn describe(capture: &Capture) -> String {
@@ -32,7 +33,10 @@ pub(super) fn describe(capture: &Capture) -> String {
     if cameras.len() > 8 {
         let _ = writeln!(text, "  and {} more", cameras.len() - 8);
     }
-    let centers = capture.views.iter().map(|view| view.center());
+    let centers = capture
+        .views
+        .iter()
+        .map(|view| camera(view).position().to_array());
     let _ = write!(text, "camera centres\n{}", bounds_text(bounds(centers)));
     let positions = || capture.points.iter().map(|point| point.position);
     let _ = writeln!(text, "points  {}", capture.points.len());
