@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use clap::{Args, ValueEnum};
 
 use super::{Failure, GlobalArgs, device, print};
-use crate::gradcheck::{self, check_file};
+use crate::gradcheck::{self, Bug, check_file};
 use crate::report::metrics::write_json;
 
 /// Check every gradient against fixtures written by PyTorch
@@ -13,6 +13,7 @@ use crate::report::metrics::write_json;
 #[command(after_help = "Examples:
   splat gradcheck --device cpu --precision f64 tests/fixtures/*.safetensors
   splat gradcheck --device wgpu --json gradients.json tests/fixtures/*.safetensors
+  splat gradcheck --perturb clamp-ignored tests/fixtures/clamped_*.safetensors
 
 Exit status: 0 every gradient holds, 1 one does not, 2 bad input.")]
 pub struct GradcheckArgs {
@@ -22,6 +23,9 @@ pub struct GradcheckArgs {
     /// Precision to compute in
     #[arg(long, value_enum, default_value_t)]
     pub precision: Precision,
+    /// Switch on a known bug, to see the check fail
+    #[arg(long, value_enum, value_name = "BUG")]
+    pub perturb: Option<Perturb>,
     /// Also write the figures as JSON
     #[arg(long, value_name = "OUT")]
     pub json: Option<PathBuf>,
@@ -46,14 +50,42 @@ impl From<Precision> for gradcheck::Precision {
     }
 }
 
+/// What `--perturb` takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Perturb {
+    /// The direction of the spherical harmonics passes no gradient on
+    DirectionDetached,
+    /// The backward of the projection forgets that the quaternion is normalised
+    QuaternionNormalisationSkipped,
+    /// Half of the gradient through the off-diagonal of the inverse covariance is lost
+    OffDiagonalHalved,
+    /// The Jacobian of the projection is not clamped off-screen
+    ClampIgnored,
+}
+
+impl From<Perturb> for Bug {
+    fn from(perturb: Perturb) -> Self {
+        match perturb {
+            Perturb::DirectionDetached => Self::DirectionDetached,
+            Perturb::QuaternionNormalisationSkipped => Self::QuaternionNormalisationSkipped,
+            Perturb::OffDiagonalHalved => Self::OffDiagonalHalved,
+            Perturb::ClampIgnored => Self::ClampIgnored,
+        }
+    }
+}
+
 /// Runs the command.
 pub(super) fn run(args: &GradcheckArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let device = device::open(global)?.device;
     let precision = args.precision.into();
+    let bug = args.perturb.map(Bug::from);
+    if let Some(bug) = bug {
+        global.say(format_args!("with a known bug switched on: {bug:?}"));
+    }
     let reports = args
         .files
         .iter()
-        .map(|path| check_file(path, &device, precision))
+        .map(|path| check_file(path, &device, precision, bug))
         .collect::<Result<Vec<_>, _>>()?;
     print(&gradcheck::table(&reports));
     if let Some(path) = &args.json {

@@ -2,104 +2,28 @@
 //! reference implementation made of them.
 
 use std::collections::HashMap;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use safetensors::{Dtype, SafeTensors};
 use splat_ops::{ImageSize, ProjectSettings, RasterizeSettings, SH_DEGREE_MAX};
 
 use super::GradcheckError;
+use super::scene::{Array, Inputs, Outputs, Scene, index_of};
 
 /// Coefficients per channel that a fixture holds, whatever its degree.
 const SH_COEFFICIENTS: usize = 16;
 
-/// A tensor on the host, in double precision, row-major.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Array {
-    /// Lengths of the dimensions.
-    pub shape: Vec<usize>,
-    /// Elements, the last dimension fastest.
-    pub values: Vec<f64>,
-}
-
-impl Array {
-    /// All zeros.
-    pub fn zeros(shape: &[usize]) -> Self {
-        Self {
-            shape: shape.to_vec(),
-            values: vec![0.0; shape.iter().product()],
-        }
-    }
-
-    /// Root mean square of the elements; 0 when there are none.
-    pub fn rms(&self) -> f64 {
-        if self.values.is_empty() {
-            return 0.0;
-        }
-        (self.values.iter().map(|v| v * v).sum::<f64>() / self.values.len() as f64).sqrt()
-    }
-}
-
-/// The differentiable inputs of a fixture, or their gradients.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Inputs {
-    /// `[N, 3]`, world space.
-    pub means: Array,
-    /// `[N, 4]`, (w, x, y, z), not normalised.
-    pub quats: Array,
-    /// `[N, 3]`, linear.
-    pub scales: Array,
-    /// `[N]`.
-    pub opacities: Array,
-    /// `[N, 16, 3]`.
-    pub sh_coeffs: Array,
-    /// `[4, 4]` or `[C, 4, 4]`, world to camera.
-    pub viewmat: Array,
-    /// `[4]` or `[C, 4]`: fx, fy, cx, cy in pixels.
-    pub intrinsics: Array,
-    /// `[3]`.
-    pub background: Array,
-}
-
-/// Rendered pictures of a fixture, or their upstream gradients; C in front where the viewmat has it.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Outputs {
-    /// `[H, W, 3]`.
-    pub image: Array,
-    /// `[H, W, 1]`.
-    pub alpha: Array,
-    /// `[H, W, 1]`, accumulated camera z. Present when the fixture has a depth loss or picture.
-    pub depth: Option<Array>,
-}
-
 /// One fixture, validated.
 #[derive(Debug, Clone)]
 pub struct Fixture {
-    /// Where it was read from.
-    pub file: PathBuf,
     /// What it covers, in words.
     pub case: String,
     /// Marked by its author as numerically hard: judged more mildly in single precision.
     pub hard: bool,
-    /// C.
-    pub cameras: usize,
-    /// N.
-    pub gaussians: usize,
-    /// Size of the picture.
-    pub size: ImageSize,
-    /// Degree of spherical harmonics to evaluate.
-    pub sh_degree: usize,
-    /// Whether opacities are multiplied by the compensation of the low-pass filter.
-    pub antialias: bool,
-    /// Settings of the projection.
-    pub project: ProjectSettings,
-    /// Settings of the rasteriser.
-    pub rasterize: RasterizeSettings,
-    /// The scene and its cameras.
-    pub inputs: Inputs,
+    /// What is rendered and differentiated; `upstream.depth` is zero where the file has a depth without a gradient.
+    pub scene: Scene,
     /// What the reference rendered.
     pub expected: Outputs,
-    /// Gradients of the loss to the pictures; depth is zero where the file has a depth without one.
-    pub upstream: Outputs,
     /// What the reference's autograd returned.
     pub gradients: Inputs,
 }
@@ -205,10 +129,8 @@ impl Reader<'_> {
 
         let (project, rasterize) = (ProjectSettings::default(), RasterizeSettings::default());
         let alpha_min = self.number("alpha_min", rasterize.alpha_min)?;
-        Ok(Fixture {
-            file: self.file.to_path_buf(),
-            case: self.metadata.get("case").cloned().unwrap_or_default(),
-            hard: self.flag("hard")?,
+        let scene = Scene {
+            source: self.file.to_path_buf(),
             cameras: front.first().copied().unwrap_or(1),
             gaussians: n,
             size,
@@ -227,8 +149,13 @@ impl Reader<'_> {
                 transmittance_min: self.number("transmittance_min", rasterize.transmittance_min)?,
             },
             inputs: inputs("")?,
-            expected,
             upstream,
+        };
+        Ok(Fixture {
+            case: self.metadata.get("case").cloned().unwrap_or_default(),
+            hard: self.flag("hard")?,
+            scene,
+            expected,
             gradients: inputs("grad.")?,
         })
     }
@@ -343,16 +270,6 @@ impl Reader<'_> {
     }
 }
 
-/// Position in every dimension of a flat index into a row-major array.
-pub(super) fn index_of(mut flat: usize, shape: &[usize]) -> Vec<usize> {
-    let mut index = vec![0; shape.len()];
-    for (place, length) in index.iter_mut().zip(shape).rev() {
-        *place = flat % length.max(&1);
-        flat /= length.max(&1);
-    }
-    index
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -423,16 +340,16 @@ mod tests {
     fn missing_metadata_take_the_defaults() {
         let fixture = read(&tensors(), &[]).unwrap();
         assert_eq!(
-            fixture.size,
+            fixture.scene.size,
             ImageSize {
                 width: 2,
                 height: 1
             }
         );
-        assert_eq!((fixture.cameras, fixture.gaussians), (1, 1));
-        assert_eq!(fixture.project, ProjectSettings::default());
-        assert_eq!(fixture.rasterize, RasterizeSettings::default());
-        assert!(!fixture.antialias && !fixture.hard && fixture.expected.depth.is_none());
+        assert_eq!((fixture.scene.cameras, fixture.scene.gaussians), (1, 1));
+        assert_eq!(fixture.scene.project, ProjectSettings::default());
+        assert_eq!(fixture.scene.rasterize, RasterizeSettings::default());
+        assert!(!fixture.scene.antialias && !fixture.hard && fixture.expected.depth.is_none());
     }
 
     #[test]
@@ -445,10 +362,16 @@ mod tests {
             ("sh_degree", "2"),
         ];
         let fixture = read(&tensors(), &entries).unwrap();
-        assert!(fixture.antialias);
-        assert_eq!((fixture.project.eps2d, fixture.sh_degree), (0.25, 2));
+        assert!(fixture.scene.antialias);
         assert_eq!(
-            (fixture.project.alpha_min, fixture.rasterize.alpha_min),
+            (fixture.scene.project.eps2d, fixture.scene.sh_degree),
+            (0.25, 2)
+        );
+        assert_eq!(
+            (
+                fixture.scene.project.alpha_min,
+                fixture.scene.rasterize.alpha_min
+            ),
             (0.5, 0.5)
         );
     }
@@ -463,7 +386,10 @@ mod tests {
             vec![1],
             0.5f32.to_le_bytes().to_vec(),
         );
-        assert_eq!(read(&tensors, &[]).unwrap().inputs.opacities.values, [0.5]);
+        assert_eq!(
+            read(&tensors, &[]).unwrap().scene.inputs.opacities.values,
+            [0.5]
+        );
     }
 
     #[test]

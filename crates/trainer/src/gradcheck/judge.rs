@@ -8,13 +8,14 @@
 use std::path::PathBuf;
 
 use super::Precision;
-use super::fixture::{Array, Fixture, Inputs, index_of};
+use super::fixture::Fixture;
 use super::run::Computed;
+use super::scene::{Array, Inputs, index_of};
 
 /// Gate of double precision, on the relative L2 error.
 const GATE_F64: f64 = 1e-9;
 /// Gate of single precision for ordinary scenes.
-const GATE_F32: f64 = 1e-4;
+const GATE_F32: f64 = 1e-5;
 /// Gate of single precision for scenes marked hard: needles, pancakes, extreme scales and offsets.
 const GATE_F32_HARD: f64 = 1e-3;
 
@@ -116,7 +117,7 @@ pub fn compare(
     let gate = gate(precision, fixture.hard);
     let ours = groups(&computed.gradients);
     let reference = groups(&fixture.gradients);
-    let inputs = groups(&fixture.inputs);
+    let inputs = groups(&fixture.scene.inputs);
     let scale = reference
         .iter()
         .zip(&inputs)
@@ -139,7 +140,7 @@ pub fn compare(
     }
     let pass = groups.iter().all(|g| g.pass) && outputs.iter().all(|o| o.pass);
     FileReport {
-        file: fixture.file.clone(),
+        file: fixture.scene.source.clone(),
         case: fixture.case.clone(),
         precision,
         hard: fixture.hard,

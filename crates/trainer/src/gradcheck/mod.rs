@@ -11,6 +11,7 @@ mod fixture;
 mod judge;
 mod report;
 mod run;
+mod scene;
 mod thresholds;
 
 use std::path::{Path, PathBuf};
@@ -18,10 +19,11 @@ use std::path::{Path, PathBuf};
 use burn::tensor::{DType, Device};
 use splat_ops::OpError;
 
-pub use fixture::{Array, Fixture, Inputs, Outputs};
+pub use fixture::Fixture;
 pub use judge::{FileReport, GroupReport, OutputReport, compare, gate};
 pub use report::{json, table};
 pub use run::{Bug, Computed, run};
+pub use scene::{Array, Inputs, Outputs, Scene};
 pub use thresholds::count_near_thresholds;
 
 /// Floating point type that a check runs in.
@@ -109,7 +111,8 @@ pub enum GradcheckError {
     },
 }
 
-/// Reads a fixture, renders it on a device, takes the gradients and judges them.
+/// Reads a fixture, renders it on a device, takes the gradients and judges them; with a known [`Bug`]
+/// switched on as a negative control.
 ///
 /// # Errors
 /// When the file is not a valid fixture, or the device or the ops refuse it. A wrong gradient is
@@ -118,11 +121,12 @@ pub fn check_file(
     path: &Path,
     device: &Device,
     precision: Precision,
+    bug: Option<Bug>,
 ) -> Result<FileReport, GradcheckError> {
-    check(&Fixture::read(path)?, device, precision, None)
+    check(&Fixture::read(path)?, device, precision, bug)
 }
 
-/// [`check_file`] on a fixture in memory, with a known [`Bug`] switched on for negative controls.
+/// [`check_file`] on a fixture in memory.
 ///
 /// # Errors
 /// When the device or the ops refuse the scene.
@@ -132,7 +136,7 @@ pub fn check(
     precision: Precision,
     bug: Option<Bug>,
 ) -> Result<FileReport, GradcheckError> {
-    let computed = run(fixture, device, precision, bug)?;
-    let near = count_near_thresholds(fixture, &computed);
+    let computed = run(&fixture.scene, device, precision, bug)?;
+    let near = count_near_thresholds(&fixture.scene, &computed);
     Ok(compare(fixture, &computed, precision, near))
 }

@@ -1,9 +1,9 @@
-//! Renders a fixture with our ops and takes the gradients of its loss with Burn's autodiff.
+//! Renders a scene with our ops and takes the gradients of its loss with Burn's autodiff.
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use splat_ops::{Projected, project, rasterize, spherical_harmonics};
 
-use super::fixture::{Array, Fixture, Inputs, Outputs};
+use super::scene::{Array, Inputs, Outputs, Scene};
 use super::{GradcheckError, Precision};
 
 /// A known bug for negative controls. A suite that passes with one of them proves nothing.
@@ -32,12 +32,12 @@ impl Bug {
     ];
 }
 
-/// What our ops make of a fixture.
+/// What our ops make of a scene.
 #[derive(Debug, Clone)]
 pub struct Computed {
-    /// Pictures, in the fixture's shapes.
+    /// Pictures, in the shapes of the scene's upstream gradients.
     pub outputs: Outputs,
-    /// Gradients of the fixture's loss, in the fixture's shapes.
+    /// Gradients of the scene's loss, in the shapes of its inputs.
     pub gradients: Inputs,
     /// Screen splats `[C, N, 9]`, as [`Projected::packed`] holds them.
     pub projected: Array,
@@ -45,12 +45,12 @@ pub struct Computed {
     pub opacities: Array,
 }
 
-/// Renders a fixture on a device and differentiates its loss.
+/// Renders a scene on a device and differentiates its loss.
 ///
 /// # Errors
 /// When the device lacks the precision, the ops refuse the scene, or results cannot be read back.
 pub fn run(
-    fixture: &Fixture,
+    scene: &Scene,
     device: &Device,
     precision: Precision,
     bug: Option<Bug>,
@@ -58,7 +58,7 @@ pub fn run(
     let dtype = precision.dtype();
     if !device.supports_dtype(dtype) {
         return Err(GradcheckError::Device {
-            file: fixture.file.clone(),
+            file: scene.source.clone(),
             reason: format!("{device:?} does not compute in {precision}"),
         });
     }
@@ -66,9 +66,9 @@ pub fn run(
         device: device.clone().autodiff(),
         dtype,
     };
-    let (c, n) = (fixture.cameras, fixture.gaussians);
-    let (w, h) = (fixture.size.width as usize, fixture.size.height as usize);
-    let inputs = &fixture.inputs;
+    let (c, n) = (scene.cameras, scene.gaussians);
+    let (w, h) = (scene.size.width as usize, scene.size.height as usize);
+    let inputs = &scene.inputs;
 
     // Leaves, cameras in front.
     let means = upload.leaf::<2>(&inputs.means, [n, 3]);
@@ -81,7 +81,7 @@ pub fn run(
     let background = upload.leaf::<1>(&inputs.background, [3]);
 
     // Screen splats.
-    let mut settings = fixture.project;
+    let mut settings = scene.project;
     if bug == Some(Bug::ClampIgnored) {
         settings.clamp_margin = 1e6;
     }
@@ -92,7 +92,7 @@ pub fn run(
         _ => (quats.clone(), scales.clone()),
     };
     let op = |source| GradcheckError::Op {
-        file: fixture.file.clone(),
+        file: scene.source.clone(),
         source,
     };
     let mut projected = project(
@@ -101,7 +101,7 @@ pub fn run(
         shape_scales,
         viewmats.clone(),
         intrinsics.clone(),
-        fixture.size,
+        scene.size,
         &settings,
     )
     .map_err(op)?;
@@ -120,14 +120,14 @@ pub fn run(
     if bug == Some(Bug::DirectionDetached) {
         directions = directions.detach();
     }
-    let colors = spherical_harmonics(sh_coeffs.clone(), directions, fixture.sh_degree)
+    let colors = spherical_harmonics(sh_coeffs.clone(), directions, scene.sh_degree)
         .map_err(op)?
         .add_scalar(0.5)
         .clamp_min(0.0);
 
     // Depth is one more colour, over a background of zero.
     let backdrop = background.clone().reshape([1, 3]).expand([c, 3]);
-    let (colors, backdrop) = match fixture.upstream.depth {
+    let (colors, backdrop) = match scene.upstream.depth {
         None => (colors, backdrop),
         Some(_) => (
             Tensor::cat(vec![colors, projected.depths().unsqueeze_dim::<3>(2)], 2),
@@ -138,7 +138,7 @@ pub fn run(
         ),
     };
     let mut blended = opacities.clone().reshape([1, -1]).repeat_dim(0, c); // [C, N]
-    if fixture.antialias {
+    if scene.antialias {
         blended = blended * projected.compensations();
     }
     let rendered = rasterize(
@@ -146,14 +146,14 @@ pub fn run(
         colors,
         blended.clone(),
         Some(backdrop),
-        &fixture.rasterize,
+        &scene.rasterize,
     )
     .map_err(op)?;
 
-    // The loss of the fixture, and its gradients.
+    // The loss, and its gradients.
     let image = rendered.image().narrow(3, 0, 3);
     let alpha = rendered.alpha();
-    let depth = fixture
+    let depth = scene
         .upstream
         .depth
         .as_ref()
@@ -163,20 +163,19 @@ pub fn run(
         (output.clone() * upstream).sum()
     };
     let mut loss =
-        weighted(&image, &fixture.upstream.image, 3) + weighted(&alpha, &fixture.upstream.alpha, 1);
+        weighted(&image, &scene.upstream.image, 3) + weighted(&alpha, &scene.upstream.alpha, 1);
     if let Some((depth, upstream)) = &depth {
         loss = loss + weighted(depth, upstream, 1);
     }
     let grads = loss.backward();
 
-    let download = Download { fixture };
-    let expected = &fixture.expected;
+    let download = Download { scene };
     Ok(Computed {
         outputs: Outputs {
-            image: download.tensor(image, &expected.image.shape)?,
-            alpha: download.tensor(alpha, &expected.alpha.shape)?,
+            image: download.tensor(image, &scene.upstream.image.shape)?,
+            alpha: download.tensor(alpha, &scene.upstream.alpha.shape)?,
             depth: depth
-                .map(|(depth, _)| download.tensor(depth, &expected.alpha.shape))
+                .map(|(depth, _)| download.tensor(depth, &scene.upstream.alpha.shape))
                 .transpose()?,
         },
         gradients: Inputs {
@@ -243,7 +242,7 @@ impl Upload {
 }
 
 struct Download<'a> {
-    fixture: &'a Fixture,
+    scene: &'a Scene,
 }
 
 impl Download<'_> {
@@ -255,7 +254,7 @@ impl Download<'_> {
         let values = tensor
             .try_into_vec_as::<f64>()
             .map_err(|error| GradcheckError::Device {
-                file: self.fixture.file.clone(),
+                file: self.scene.source.clone(),
                 reason: format!("results cannot be read back: {error}"),
             })?;
         Ok(Array {

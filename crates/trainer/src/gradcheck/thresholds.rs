@@ -1,7 +1,7 @@
 //! Counts pixels where one rounding error more or less decides whether a splat is blended.
 
-use super::fixture::Fixture;
 use super::run::Computed;
+use super::scene::Scene;
 
 /// Relative distance to a threshold that counts as near.
 const NEAR: f64 = 1e-6;
@@ -10,12 +10,12 @@ const NEAR: f64 = 1e-6;
 /// of the threshold it is compared with.
 ///
 /// Every splat against every pixel, in double precision, from the screen splats of the check.
-pub fn count_near_thresholds(fixture: &Fixture, computed: &Computed) -> usize {
-    let n = fixture.gaussians;
+pub fn count_near_thresholds(scene: &Scene, computed: &Computed) -> usize {
+    let n = scene.gaussians;
     if n == 0 {
         return 0;
     }
-    let (width, height) = (fixture.size.width, fixture.size.height);
+    let (width, height) = (scene.size.width, scene.size.height);
     let cameras = computed.projected.values.chunks_exact(9 * n);
     let opacities = computed.opacities.values.chunks_exact(n);
     cameras
@@ -29,16 +29,14 @@ pub fn count_near_thresholds(fixture: &Fixture, computed: &Computed) -> usize {
             splats.sort_by(|(a, _), (b, _)| a[2].total_cmp(&b[2])); // stable: ties by index
             let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
             pixels
-                .filter(|(x, y)| {
-                    is_near(fixture, &splats, f64::from(*x) + 0.5, f64::from(*y) + 0.5)
-                })
+                .filter(|(x, y)| is_near(scene, &splats, f64::from(*x) + 0.5, f64::from(*y) + 0.5))
                 .count()
         })
         .sum()
 }
 
-fn is_near(fixture: &Fixture, splats: &[(&[f64], &f64)], x: f64, y: f64) -> bool {
-    let settings = &fixture.rasterize;
+fn is_near(scene: &Scene, splats: &[(&[f64], &f64)], x: f64, y: f64) -> bool {
+    let settings = &scene.rasterize;
     let near = |value: f64, threshold: f64| (value - threshold).abs() <= NEAR * threshold;
     let mut transmittance = 1.0;
     for (row, opacity) in splats {

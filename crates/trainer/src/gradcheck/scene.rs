@@ -1,0 +1,99 @@
+//! What is rendered and differentiated in a check: a scene, its cameras, and a loss.
+
+use std::path::PathBuf;
+
+use splat_ops::{ImageSize, ProjectSettings, RasterizeSettings};
+
+/// A tensor on the host, in double precision, row-major.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Array {
+    /// Lengths of the dimensions.
+    pub shape: Vec<usize>,
+    /// Elements, the last dimension fastest.
+    pub values: Vec<f64>,
+}
+
+impl Array {
+    /// All zeros.
+    pub fn zeros(shape: &[usize]) -> Self {
+        Self {
+            shape: shape.to_vec(),
+            values: vec![0.0; shape.iter().product()],
+        }
+    }
+
+    /// Root mean square of the elements; 0 when there are none.
+    pub fn rms(&self) -> f64 {
+        if self.values.is_empty() {
+            return 0.0;
+        }
+        (self.values.iter().map(|v| v * v).sum::<f64>() / self.values.len() as f64).sqrt()
+    }
+}
+
+/// The differentiable inputs of a fixture, or their gradients.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Inputs {
+    /// `[N, 3]`, world space.
+    pub means: Array,
+    /// `[N, 4]`, (w, x, y, z), not normalised.
+    pub quats: Array,
+    /// `[N, 3]`, linear.
+    pub scales: Array,
+    /// `[N]`.
+    pub opacities: Array,
+    /// `[N, 16, 3]`.
+    pub sh_coeffs: Array,
+    /// `[4, 4]` or `[C, 4, 4]`, world to camera.
+    pub viewmat: Array,
+    /// `[4]` or `[C, 4]`: fx, fy, cx, cy in pixels.
+    pub intrinsics: Array,
+    /// `[3]`.
+    pub background: Array,
+}
+
+/// Rendered pictures of a fixture, or their upstream gradients; C in front where the viewmat has it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Outputs {
+    /// `[H, W, 3]`.
+    pub image: Array,
+    /// `[H, W, 1]`.
+    pub alpha: Array,
+    /// `[H, W, 1]`, accumulated camera z. Present when the fixture has a depth loss or picture.
+    pub depth: Option<Array>,
+}
+
+/// A scene, its cameras, and the gradients of a loss to its pictures.
+#[derive(Debug, Clone)]
+pub struct Scene {
+    /// The file it was read from, or the case that made it. For messages.
+    pub source: PathBuf,
+    /// C.
+    pub cameras: usize,
+    /// N.
+    pub gaussians: usize,
+    /// Size of the picture.
+    pub size: ImageSize,
+    /// Degree of spherical harmonics to evaluate.
+    pub sh_degree: usize,
+    /// Whether opacities are multiplied by the compensation of the low-pass filter.
+    pub antialias: bool,
+    /// Settings of the projection.
+    pub project: ProjectSettings,
+    /// Settings of the rasteriser.
+    pub rasterize: RasterizeSettings,
+    /// Gaussians and cameras.
+    pub inputs: Inputs,
+    /// Gradients of the loss to the pictures.
+    pub upstream: Outputs,
+}
+
+/// Position in every dimension of a flat index into a row-major array.
+pub(super) fn index_of(mut flat: usize, shape: &[usize]) -> Vec<usize> {
+    let mut index = vec![0; shape.len()];
+    for (place, length) in index.iter_mut().zip(shape).rev() {
+        *place = flat % length.max(&1);
+        flat /= length.max(&1);
+    }
+    index
+}
