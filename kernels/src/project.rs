@@ -8,7 +8,9 @@
 //! a = |V1|² + e, b = V1·V2                        det = |m|² + e(|V1|² + |V2|²) + e²
 //! w11 = 1/√a, w22 = √(a/det), w21 = -(b/a) w22    compensation = |m| / √det
 //! ```
-//! The determinant is a sum of terms that are never negative (Cauchy-Binet), so needles keep their precision.
+//! The determinant is a sum of terms that are never negative (Cauchy-Binet), so needles keep their precision. V and e
+//! are taken in units of the splat's own size (k pixels), so that nothing over- or underflows, be the splat a millionth
+//! of a pixel or a million pictures wide.
 //! One unit projects one Gaussian to one camera. Gradients of Gaussians are summed over cameras inside one unit;
 //! gradients of cameras by blocks of Gaussians and then over the blocks, always in the same order: no atomics.
 
@@ -19,6 +21,9 @@ use crate::math::{Mat3, Quat, Vec3, is_finite};
 
 /// Floats of one projected splat: mean x, y, depth z, w11, w21, w22, compensation, extent x, y.
 pub const PACKED: usize = 9;
+
+/// Splats larger than this many pixels are all alike: constant over any picture.
+const SIZE_MAX: f32 = 1e12;
 
 /// Values of a camera's gradient: three rows [W | t], then fx, fy, cx, cy.
 const CAMERA_VALUES: usize = 16;
@@ -53,14 +58,14 @@ impl ProjectSettings {
             self.height as f32,
             self.near,
             self.far,
-            self.eps2d,
+            self.eps2d.sqrt(),
             self.clamp_margin,
             (-2.0 * self.alpha_min.ln()).max(0.0).sqrt(),
         )
     }
 }
 
-/// [`ProjectSettings`] on the device; `reach` = √(2 ln(1/alpha_min)), standard deviations to the edge of a splat.
+/// [`ProjectSettings`] on the device; `blur` = √e; `reach` = √(2 ln(1/alpha_min)), standard deviations to the edge of a splat.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 struct Uniforms {
@@ -68,7 +73,7 @@ struct Uniforms {
     height: f32,
     near: f32,
     far: f32,
-    eps2d: f32,
+    blur: f32,
     clamp_margin: f32,
     reach: f32,
 }
@@ -176,10 +181,18 @@ struct Splat {
     /// Rows of J W R.
     jwr1: Vec3,
     jwr2: Vec3,
+    /// Unit of length from here to `w22`, in pixels.
+    k: f32,
+    /// Larger than [`SIZE_MAX`]: its shape has no influence.
+    flat: bool,
     v1: Vec3,
     v2: Vec3,
+    /// Direction of the minors, not normalised, and its length.
     m: Vec3,
+    m_norm: f32,
+    /// Length of the minors.
     m_length: f32,
+    e: f32,
     a: f32,
     b: f32,
     det: f32,
@@ -215,25 +228,41 @@ fn project_splat(g: Gaussian, camera: Camera, s: Uniforms) -> Splat {
     let r = q.to_matrix();
     let jwr1 = r.transpose_mul_vec(jw1);
     let jwr2 = r.transpose_mul_vec(jw2);
-    let v1 = jwr1.mul(g.scale);
-    let v2 = jwr2.mul(g.scale);
 
-    let e = s.eps2d;
-    let m = v1.cross(v2);
+    // V over its largest entry, `size` pixels.
+    let largest_scale = g.scale.max_abs();
+    let relative = g.scale.over(largest_scale);
+    let row1 = jwr1.mul(relative);
+    let row2 = jwr2.mul(relative);
+    let largest_entry = max(row1.max_abs(), row2.max_abs());
+    let row1 = row1.over(largest_entry);
+    let row2 = row2.over(largest_entry);
+    let size = largest_entry * largest_scale;
+    let flat = size > SIZE_MAX;
+    let size = min(size, SIZE_MAX);
+
+    let k = max(size, s.blur);
+    let share = size / k;
+    let blur = s.blur / k;
+    let v1 = row1.scale(share);
+    let v2 = row2.scale(share);
+    let m = row1.cross(row2);
+    let m_norm = f32::sqrt(m.dot(m));
+    let m_length = share * share * m_norm;
     let v1_v1 = v1.dot(v1);
     let v2_v2 = v2.dot(v2);
-    let m_m = m.dot(m);
+    let e = blur * blur;
     let a = v1_v1 + e;
     let b = v1.dot(v2);
-    let det = m_m + e * (v1_v1 + v2_v2) + e * e;
-    let m_length = f32::sqrt(m_m);
+    let det = m_length * m_length + e * (v1_v1 + v2_v2) + e * e;
 
     let w11 = 1.0f32 / f32::sqrt(a);
     let w22 = f32::sqrt(a / det);
     let w21 = -(b / a) * w22;
     let compensation = m_length / f32::sqrt(det);
-    let extent_x = s.reach * f32::sqrt(a);
-    let extent_y = s.reach * f32::sqrt(v2_v2 + e);
+    let reach = s.reach * k;
+    let extent_x = reach * f32::sqrt(a);
+    let extent_y = reach * f32::sqrt(v2_v2 + e);
 
     // Written so that NaN fails; a non-finite input shows in one of these values.
     let finite = p.is_finite()
@@ -267,10 +296,14 @@ fn project_splat(g: Gaussian, camera: Camera, s: Uniforms) -> Splat {
         jw2,
         jwr1,
         jwr2,
+        k,
+        flat,
         v1,
         v2,
         m,
+        m_norm,
         m_length,
+        e,
         a,
         b,
         det,
@@ -306,9 +339,9 @@ fn project_forward(
             packed[at] = splat.mean_x;
             packed[at + 1] = splat.mean_y;
             packed[at + 2] = splat.p.z;
-            packed[at + 3] = splat.w11;
-            packed[at + 4] = splat.w21;
-            packed[at + 5] = splat.w22;
+            packed[at + 3] = splat.w11 / splat.k;
+            packed[at + 4] = splat.w21 / splat.k;
+            packed[at + 5] = splat.w22 / splat.k;
             packed[at + 6] = splat.compensation;
             packed[at + 7] = splat.extent_x;
             packed[at + 8] = splat.extent_y;
@@ -364,15 +397,15 @@ fn project_vjp(
     g: Gaussian,
     camera: Camera,
     splat: Splat,
-    e: f32,
     grad_packed: &[f32],
     at: usize,
 ) -> Gradient {
     let g_mean_x = grad_packed[at];
     let g_mean_y = grad_packed[at + 1];
     let g_depth = grad_packed[at + 2];
-    let g_w11 = grad_packed[at + 3];
-    let g_w21 = grad_packed[at + 4];
+    // Packed in 1 / pixels, here in 1 / k.
+    let g_w11 = grad_packed[at + 3] / splat.k;
+    let g_w21 = grad_packed[at + 4] / splat.k;
     let g_compensation = grad_packed[at + 6];
     let Splat {
         p,
@@ -381,6 +414,7 @@ fn project_vjp(
         q,
         r,
         m,
+        e,
         a,
         b,
         det,
@@ -391,26 +425,26 @@ fn project_vjp(
     } = splat;
 
     // w21 = -(b/a) w22,  w22 = √(a/det),  w11 = 1/√a,  compensation = |m|/√det
-    let g_w22 = grad_packed[at + 5] - g_w21 * (b / a);
+    let g_w22 = grad_packed[at + 5] / splat.k - g_w21 * (b / a);
     let g_b = -g_w21 * (w22 / a);
     let g_a = g_w21 * (b / a) * (w22 / a) + 0.5f32 * (g_w22 * w22 - g_w11 * splat.w11) / a;
     let g_det = -0.5f32 * (g_w22 * w22 + g_compensation * splat.compensation) / det;
     // det = |m|² + e(|V1|² + |V2|²) + e²;  the gradient of |m| at 0 is 0
-    let g_length = select(
-        splat.m_length > 0.0f32,
-        g_compensation / (f32::sqrt(det) * splat.m_length),
-        0.0f32,
-    );
-    let g_m = m.scale(2.0f32 * g_det + g_length);
+    let g_length = 2.0f32 * g_det * splat.m_length + g_compensation / f32::sqrt(det);
+    let g_m = m.scale(g_length).over(splat.m_norm);
+    // V in units of k -> V in pixels
+    let pixels = select(splat.flat, 0.0f32, 1.0f32 / splat.k);
     // m = V1 x V2,  a = |V1|² + e,  b = V1·V2
     let g_v1 = v2
         .cross(g_m)
         .add(v1.scale(2.0f32 * (e * g_det + g_a)))
-        .add(v2.scale(g_b));
+        .add(v2.scale(g_b))
+        .scale(pixels);
     let g_v2 = g_m
         .cross(v1)
         .add(v2.scale(2.0f32 * e * g_det))
-        .add(v1.scale(g_b));
+        .add(v1.scale(g_b))
+        .scale(pixels);
 
     // V = (J W R) diag(s)
     let g_scale = g_v1.mul(splat.jwr1).add(g_v2.mul(splat.jwr2));
@@ -505,7 +539,7 @@ fn project_backward_gaussians(
             let splat = project_splat(g, camera, s);
             if splat.visible {
                 let at = (c * gaussians + index) * PACKED;
-                let grad = project_vjp(g, camera, splat, s.eps2d, grad_packed, at);
+                let grad = project_vjp(g, camera, splat, grad_packed, at);
                 mean_x += grad.mean.x;
                 mean_y += grad.mean.y;
                 mean_z += grad.mean.z;
@@ -567,7 +601,7 @@ fn project_backward_cameras(
                 let splat = project_splat(g, camera, s);
                 if splat.visible {
                     let at = (c * gaussians + index) * PACKED;
-                    let grad = project_vjp(g, camera, splat, s.eps2d, grad_packed, at);
+                    let grad = project_vjp(g, camera, splat, grad_packed, at);
                     sums[0] += grad.w.r0.x;
                     sums[1] += grad.w.r0.y;
                     sums[2] += grad.w.r0.z;

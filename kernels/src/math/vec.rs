@@ -94,6 +94,16 @@ impl Vec3 {
         max(max(f32::abs(self.x), f32::abs(self.y)), f32::abs(self.z))
     }
 
+    /// self / divisor; zero where the divisor is.
+    pub fn over(self, divisor: f32) -> Vec3 {
+        let safe = select(divisor == 0.0f32, 1.0f32, divisor);
+        Vec3 {
+            x: self.x / safe,
+            y: self.y / safe,
+            z: self.z / safe,
+        }
+    }
+
     /// No component is infinite or NaN.
     pub fn is_finite(self) -> bool {
         is_finite(self.x) && is_finite(self.y) && is_finite(self.z)

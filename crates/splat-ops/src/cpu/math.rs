@@ -32,6 +32,18 @@ pub(super) fn scale<T: Real>(a: Vec3<T>, s: T) -> Vec3<T> {
     [a[0] * s, a[1] * s, a[2] * s]
 }
 
+/// Largest absolute value.
+#[inline(always)]
+pub(super) fn largest<T: Real>(a: Vec3<T>) -> T {
+    a[0].abs().greatest(a[1].abs()).greatest(a[2].abs())
+}
+
+/// `a / s`; zero where s is.
+#[inline(always)]
+pub(super) fn over<T: Real>(a: Vec3<T>, s: T) -> Vec3<T> {
+    if s == T::ZERO { a } else { a.map(|x| x / s) }
+}
+
 /// Componentwise product.
 #[inline(always)]
 pub(super) fn hadamard<T: Real>(a: Vec3<T>, b: Vec3<T>) -> Vec3<T> {

@@ -13,6 +13,8 @@
 //! ```
 //!
 //! `a c - b b` would lose the determinant of a needle in single precision; the minors keep it.
+//! V and e are taken in units of the splat's own size (`k` pixels), so that nothing over- or underflows, be the splat
+//! a millionth of a pixel or a million pictures wide.
 
 use core::marker::PhantomData;
 
@@ -24,6 +26,9 @@ use super::math::*;
 use super::real::Real;
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::ProjectArgs;
+
+/// Splats larger than this many pixels are all alike: constant over any picture.
+const SIZE_MAX: f64 = 1e12;
 
 /// Gaussians per unit of parallel work. Fixed, so that sums over Gaussians have a fixed order.
 const CHUNK: usize = 512;
@@ -44,7 +49,8 @@ struct Camera<T> {
     height: T,
     near: T,
     far: T,
-    eps2d: T,
+    /// Square root of `eps2d`.
+    blur: T,
     /// Standard deviations to where alpha has fallen from 1 to `alpha_min`.
     reach: T,
 }
@@ -73,7 +79,7 @@ impl<T: Real> Camera<T> {
             height,
             near: T::of(args.settings.near),
             far: T::of(args.settings.far),
-            eps2d: T::of(args.settings.eps2d),
+            blur: T::of(args.settings.eps2d.sqrt()),
             reach: T::of((-2.0 * args.settings.alpha_min.ln()).max(0.0).sqrt()),
         }
     }
@@ -102,12 +108,24 @@ struct Splat<T> {
     jw: Mat23<T>,
     /// J W R.
     jwr: Mat23<T>,
+    /// Unit of length of everything below but `packed`, in pixels.
+    k: T,
+    /// Larger than `SIZE_MAX`: its shape has no influence.
+    flat: bool,
     v1: Vec3<T>,
     v2: Vec3<T>,
+    /// Direction of the minors, not normalised, and its length.
     minors: Vec3<T>,
+    minors_norm: T,
+    /// Length of the minors.
+    minors_length: T,
+    e: T,
     a: T,
     b: T,
     det: T,
+    w11: T,
+    w21: T,
+    w22: T,
     packed: [T; PROJECTED_WIDTH],
 }
 
@@ -137,19 +155,32 @@ impl<T: Real> Splat<T> {
             ),
         ];
         let jwr = jw.map(|row| apply_transposed(&rotation, row));
-        let [v1, v2] = jwr.map(|row| hadamard(row, g.scale));
-        let minors = cross(v1, v2);
+        // V over its largest entry, `size` pixels.
+        let largest_scale = largest(g.scale);
+        let rows = jwr.map(|row| hadamard(row, over(g.scale, largest_scale)));
+        let largest_entry = largest(rows[0]).greatest(largest(rows[1]));
+        let rows = rows.map(|row| over(row, largest_entry));
+        let size = largest_entry * largest_scale;
+        let flat = size > T::of(SIZE_MAX);
+        let size = size.least(T::of(SIZE_MAX));
+
+        let k = size.greatest(camera.blur);
+        let (share, blur) = (size / k, camera.blur / k);
+        let [v1, v2] = rows.map(|row| scale(row, share));
+        let minors = cross(rows[0], rows[1]);
+        let minors_norm = dot(minors, minors).sqrt();
+        let minors_length = share * share * minors_norm;
         let (n1, n2) = (dot(v1, v1), dot(v2, v2));
-        let e = camera.eps2d;
-        let minors2 = dot(minors, minors);
+        let e = blur * blur;
         let (a, b) = (n1 + e, dot(v1, v2));
-        let det = minors2 + e * (n1 + n2) + e * e;
+        let det = minors_length * minors_length + e * (n1 + n2) + e * e;
 
         let mean = [
             camera.fx * u_free + camera.cx,
             camera.fy * v_free + camera.cy,
         ];
-        let extent = [camera.reach * a.sqrt(), camera.reach * (n2 + e).sqrt()];
+        let reach = camera.reach * k;
+        let extent = [reach * a.sqrt(), reach * (n2 + e).sqrt()];
         let reaches = mean[0] + extent[0] > T::ZERO
             && mean[0] - extent[0] < camera.width
             && mean[1] + extent[1] > T::ZERO
@@ -157,15 +188,17 @@ impl<T: Real> Splat<T> {
         if !reaches {
             return None;
         }
+        let w11 = T::ONE / a.sqrt();
         let w22 = (a / det).sqrt();
+        let w21 = -(b / a) * w22;
         let packed = [
             mean[0],
             mean[1],
             z,
-            T::ONE / a.sqrt(),
-            -(b / a) * w22,
-            w22,
-            (minors2 / det).sqrt(),
+            w11 / k,
+            w21 / k,
+            w22 / k,
+            minors_length / det.sqrt(),
             extent[0],
             extent[1],
         ];
@@ -180,12 +213,20 @@ impl<T: Real> Splat<T> {
             rotation,
             jw,
             jwr,
+            k,
+            flat,
             v1,
             v2,
             minors,
+            minors_norm,
+            minors_length,
+            e,
             a,
             b,
             det,
+            w11,
+            w21,
+            w22,
             packed,
         })
     }
@@ -233,24 +274,25 @@ fn splat_backward<T: Real>(
 ) -> Gradient<T> {
     let half = T::of(0.5);
     let two = T::of(2.0);
-    let [_, _, _, w11, w21, w22, compensation, ..] = s.packed;
-    let e = camera.eps2d;
+    let (e, w11, w22) = (s.e, s.w11, s.w22);
+    let compensation = s.packed[6];
 
-    // Inverse Cholesky factor and compensation -> a, b, det, |m|.
-    let g22 = grad[5] - grad[4] * s.b / s.a;
-    let db = -grad[4] * w22 / s.a;
-    let da = (half * g22 * w22 - grad[4] * w21) / s.a - half * grad[3] * w11 * w11 * w11;
+    // Inverse Cholesky factor (packed in 1 / pixels, here in 1 / k) and compensation -> a, b, det, |m|.
+    let [g11, g21, g22] = [3, 4, 5].map(|i| grad[i] / s.k);
+    let g22 = g22 - g21 * s.b / s.a;
+    let db = -g21 * w22 / s.a;
+    let da = (half * g22 * w22 - g21 * s.w21) / s.a - half * g11 * w11 * w11 * w11;
     let ddet = -half * (g22 * w22 + grad[6] * compensation) / s.det;
-    let minors_length = dot(s.minors, s.minors).sqrt();
-    // |m| has no derivative at zero; zero is its least subgradient.
-    let dlength = if minors_length > T::ZERO {
-        grad[6] / (s.det.sqrt() * minors_length)
-    } else {
-        T::ZERO
-    };
+    let dlength = two * ddet * s.minors_length + grad[6] / s.det.sqrt();
 
-    // a, b, det, |m| -> V.
-    let dm = scale(s.minors, two * ddet + dlength);
+    // a, b, det, |m| -> V. |m| has no derivative at zero; zero is its least subgradient.
+    let dm = if s.minors_norm > T::ZERO {
+        scale(s.minors, dlength / s.minors_norm)
+    } else {
+        [T::ZERO; 3]
+    };
+    // V in units of k -> V in pixels.
+    let pixels = if s.flat { T::ZERO } else { T::ONE / s.k };
     let dv1 = add(
         add(scale(s.v1, two * (da + e * ddet)), scale(s.v2, db)),
         cross(s.v2, dm),
@@ -259,6 +301,7 @@ fn splat_backward<T: Real>(
         add(scale(s.v2, two * e * ddet), scale(s.v1, db)),
         cross(dm, s.v1),
     );
+    let (dv1, dv2) = (scale(dv1, pixels), scale(dv2, pixels));
 
     // V = (J W R) diag(s) -> scales, R, J W.
     let dscale = add(hadamard(dv1, s.jwr[0]), hadamard(dv2, s.jwr[1]));
