@@ -5,6 +5,8 @@
 
 mod adaptive;
 mod edit;
+mod relocation;
 
 pub use adaptive::{AdaptiveDensity, AdaptiveSettings, Refinement, RunShape};
 pub use edit::{RowPlan, apply_plan, clamp_opacities};
+pub use relocation::relocate;
