@@ -22,6 +22,15 @@ impl Camera {
         -(r0.truncate() * r0.w + r1.truncate() * r1.w + r2.truncate() * r2.w)
     }
 
+    /// The same camera in a world that counts from `origin`. To be done before the camera becomes a tensor: in double
+    /// precision the difference of two large coordinates is exact.
+    pub fn relative_to(&self, origin: [f64; 3]) -> Self {
+        Self {
+            viewmat: self.viewmat * DMat4::from_translation(DVec3::from(origin)),
+            ..*self
+        }
+    }
+
     /// The camera as the ops take it.
     pub fn tensors(&self, device: &Device) -> CameraTensors {
         let rows: Vec<f32> = (0..4)
@@ -77,5 +86,10 @@ mod tests {
         };
         let seen = viewmat.transform_point3(camera.position());
         assert!(seen.length() < 1e-12, "{seen}");
+
+        let (origin, point) = (DVec3::new(4e6, -5e5, 1e3), DVec3::new(0.5, -2.0, 7.0));
+        let local = camera.relative_to(origin.to_array());
+        let seen = local.viewmat.transform_point3(point);
+        assert!((seen - viewmat.transform_point3(origin + point)).length() < 1e-8);
     }
 }

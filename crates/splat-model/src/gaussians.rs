@@ -10,7 +10,11 @@ use crate::files::SplatData;
 /// opacities as logits.
 #[derive(Module, Debug)]
 pub struct Gaussians {
-    /// Centres in the world, `[N, 3]`.
+    /// Where in the world the means count from, see [`SplatData::origin`]. Cameras that look at the model must count
+    /// from there too: [`Camera::relative_to`](crate::Camera::relative_to).
+    #[module(skip)]
+    pub origin: [f64; 3],
+    /// Centres relative to the origin, `[N, 3]`, world units.
     pub means: Param<Tensor<2>>,
     /// Logarithms of the standard deviations along the axes, `[N, 3]`.
     pub log_scales: Param<Tensor<2>>,
@@ -36,6 +40,7 @@ impl Gaussians {
         };
         let rest = sh_coefficient_count(data.sh_degree) - 1;
         Self {
+            origin: data.origin,
             means: tensor2(data.means.as_flattened().to_vec(), 3),
             log_scales: tensor2(data.log_scales.as_flattened().to_vec(), 3),
             quats: tensor2(data.quats.as_flattened().to_vec(), 4),
@@ -59,6 +64,7 @@ impl Gaussians {
     /// Reads the values back from the device.
     pub fn to_data(&self) -> SplatData {
         SplatData {
+            origin: self.origin,
             means: rows(self.means.val()),
             log_scales: rows(self.log_scales.val()),
             quats: rows(self.quats.val()),
@@ -98,7 +104,7 @@ impl Gaussians {
 
     /// Opacities in (0, 1), `[N]`.
     pub fn opacities(&self) -> Tensor<1> {
-        activation::sigmoid(self.opacity_logits.val())
+        sigmoid(self.opacity_logits.val())
     }
 
     /// Coefficients `[N, (degree + 1)^2, 3]`, up to a degree that the model has.
@@ -118,6 +124,17 @@ impl Gaussians {
     }
 }
 
+/// The logistic function as `exp(min(x, 0)) / (1 + exp(-|x|))`. Burn's own differentiates it as `o (1 - o)`, which is
+/// exactly zero once o rounds to one (from a logit of 17 on in single precision): a Gaussian could never become
+/// transparent again. Differentiated term by term this form keeps every digit at both ends. The two halves of x split
+/// so that exactly one of them has a derivative, at zero too.
+fn sigmoid(x: Tensor<1>) -> Tensor<1> {
+    let negative = x.clone().clamp_max(0.0);
+    let positive = activation::relu(x);
+    let small = (negative.clone() - positive).exp();
+    negative.exp() / small.add_scalar(1.0)
+}
+
 /// A float tensor's values on the host.
 pub(crate) fn host<const R: usize>(tensor: Tensor<R>) -> Vec<f32> {
     tensor
@@ -129,4 +146,28 @@ pub(crate) fn host<const R: usize>(tensor: Tensor<R>) -> Vec<f32> {
 
 fn rows<const W: usize>(tensor: Tensor<2>) -> Vec<[f32; W]> {
     host(tensor).as_chunks().0.to_vec()
+}
+
+#[cfg(all(test, feature = "cpu"))]
+mod tests {
+    use super::*;
+
+    /// At both ends, at the bend, and between: opacity and its gradient to a few ulp of `1 / (1 + exp(-x))` in double
+    /// precision. Below a logit of -87 the opacity itself leaves the range of normal floats.
+    #[test]
+    fn opacities_and_their_gradients_keep_their_digits() {
+        let logits = [-80.0, -30.0, -5.0, -0.1, 0.0, 0.1, 5.0, 17.0, 30.0, 80.0f32];
+        let device = Device::flex().autodiff();
+        let x = Tensor::<1>::from_data(TensorData::from(logits), &device).require_grad();
+        let opacities = sigmoid(x.clone());
+        let gradient = x.grad(&opacities.clone().sum().backward()).unwrap();
+        let (opacities, gradient) = (host(opacities), host(gradient));
+        for (i, x) in logits.into_iter().map(f64::from).enumerate() {
+            let opacity = 1.0 / (1.0 + (-x).exp());
+            let slope = 1.0 / ((1.0 + (-x).exp()) * (1.0 + x.exp()));
+            let error = |got: f32, want: f64| (f64::from(got) / want - 1.0).abs();
+            assert!(error(opacities[i], opacity) < 1e-6, "opacity at {x}");
+            assert!(error(gradient[i], slope) < 1e-6, "gradient at {x}");
+        }
+    }
 }

@@ -84,6 +84,7 @@ pub fn splats_from_points(
         |color: &[u8; 3]| color.map(|channel| ((f64::from(channel) / 255.0 - 0.5) / SH_C0) as f32);
     let opacity = settings.opacity.clamp(1e-6, 1.0 - 1e-6);
     Ok(SplatData {
+        origin: [0.0; 3],
         means: positions.to_vec(),
         log_scales,
         quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
@@ -120,6 +121,20 @@ fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<f64> {
         .collect()
 }
 
+/// Where the means of a scene should count from: the world's zero, unless it is so far away that 32-bit floats
+/// would round visible detail away; then the middle of the cameras, in whole units.
+pub fn scene_origin(cameras: &[Camera]) -> [f64; 3] {
+    /// From 100 scenes away on, a float resolves less than 1e-5 of the scene.
+    const FAR: f64 = 100.0;
+    let positions = cameras.iter().map(Camera::position);
+    let mean = positions.sum::<glam::DVec3>() / cameras.len().max(1) as f64;
+    if mean.abs().max_element() > FAR * scene_scale(cameras) {
+        mean.round().to_array()
+    } else {
+        [0.0; 3]
+    }
+}
+
 /// Size of a scene as 3DGS measures it: 1.1 times the largest distance of a camera from the mean
 /// camera, in world units. With one camera, or several in one place, 1.
 pub fn scene_scale(cameras: &[Camera]) -> f64 {
@@ -150,6 +165,22 @@ mod tests {
         let expected = ((1.0 + 4.0 + 9.0) / 3.0f64).sqrt().ln();
         assert!((f64::from(splats.log_scales[0][0]) - expected).abs() < 1e-6);
         assert_eq!(splats.sh_rest.len(), 5 * 15 * 3);
+    }
+
+    #[test]
+    fn only_a_scene_far_from_zero_gets_an_origin() {
+        let camera = |x: f64, y: f64| Camera {
+            viewmat: glam::DMat4::from_translation(glam::DVec3::new(-x, -y, 0.0)),
+            intrinsics: [50.0, 50.0, 8.0, 8.0],
+            size: splat_ops::ImageSize {
+                width: 16,
+                height: 16,
+            },
+        };
+        let near = [camera(0.0, 3.0), camera(2.0, 3.0), camera(4.0, 50.0)];
+        assert_eq!(scene_origin(&near), [0.0; 3]);
+        let far = [camera(4e6, 3.25), camera(4e6 + 2.0, 3.5)];
+        assert_eq!(scene_origin(&far), [4_000_001.0, 3.0, 0.0]);
     }
 
     #[test]

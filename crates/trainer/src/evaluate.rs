@@ -45,7 +45,8 @@ pub fn evaluate(
 ) -> Result<Scores, OpError> {
     let mut scores = Vec::with_capacity(views.len());
     for view in views {
-        let rendered = render(gaussians, &camera(view).tensors(device), settings)?;
+        let camera = camera(view).relative_to(gaussians.origin);
+        let rendered = render(gaussians, &camera.tensors(device), settings)?;
         let image = rendered.image().clamp(0.0, 1.0);
         let target = photo(view, device);
         let scalar = |value: Tensor<1>| f64::from(value.into_scalar::<f32>());

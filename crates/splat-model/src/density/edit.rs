@@ -75,6 +75,7 @@ pub fn apply_plan(gaussians: Gaussians, plan: &RowPlan, logs: &[EditLog; 6]) -> 
     let gather2 = |x: Tensor<2>| x.select(0, source.clone());
     let gather3 = |x: Tensor<3>| x.select(0, source.clone());
     Gaussians {
+        origin: gaussians.origin,
         means: edit(gaussians.means, |x| gather2(x) + mean_offset),
         log_scales: edit(gaussians.log_scales, |x| gather2(x) + log_scale_offset),
         quats: edit(gaussians.quats, gather2),

@@ -11,7 +11,10 @@ pub use error::SceneFileError;
 /// A scene as files hold it: plain arrays, one entry per Gaussian, in the parametrisation that is trained.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SplatData {
-    /// Centres in the world, `[N][3]`.
+    /// Where in the world the means count from: 0 unless the scene lies far from the world's zero, as in map
+    /// coordinates, where 32-bit floats would round its details away.
+    pub origin: [f64; 3],
+    /// Centres relative to `origin`, `[N][3]`, world units.
     pub means: Vec<[f32; 3]>,
     /// Natural logarithm of the scales, `[N][3]`.
     pub log_scales: Vec<[f32; 3]>,

@@ -10,6 +10,9 @@
 //! `f_rest_*` runs over the coefficients of red, then of green, then of blue (channel-major; in [`SplatData`] it is
 //! coefficient-major). The normals are written as 0 and not read.
 //!
+//! A scene whose means do not count from the world's zero ([`SplatData::origin`]) says so in a comment,
+//! `comment origin X Y Z`; other programs see it without that offset.
+//!
 //! [`write()`] writes binary little endian. [`read()`] also takes ASCII and big endian, properties in any order and of any
 //! number type (such as `double`), and ignores properties and elements it does not know.
 
@@ -26,6 +29,9 @@ use ply_rs_bw::ply::{
 use ply_rs_bw::writer::Writer;
 
 use super::{SceneFileError, SplatData};
+
+/// First word of the comment that holds the origin.
+const ORIGIN: &str = "origin";
 
 /// Writes `scene` to `path`, whole or not at all: beside it first, then renamed.
 ///
@@ -57,6 +63,10 @@ pub fn write(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
         vertex.properties.insert(name.clone(), property);
     }
     header.elements.insert("vertex".to_owned(), vertex);
+    if scene.origin != [0.0; 3] {
+        let [x, y, z] = scene.origin;
+        header.comments.push(format!("{ORIGIN} {x} {y} {z}"));
+    }
     let vertex = &header.elements["vertex"];
 
     let writer = Writer::<Row>::new();
@@ -124,6 +134,7 @@ pub fn read(path: &Path) -> Result<SplatData, SceneFileError> {
         // A damaged count must not become a huge allocation: every property takes at least a byte.
         let most = file_len / element.properties.len().max(1) as u64;
         let mut scene = columns.empty_scene(element.count.min(most as usize));
+        scene.origin = origin(path, &header)?;
         for index in 0..element.count {
             let row = rows.next(reader.get_mut(), index)?;
             columns
@@ -141,6 +152,33 @@ pub fn read(path: &Path) -> Result<SplatData, SceneFileError> {
     Err(SceneFileError::Empty {
         path: path.to_path_buf(),
     })
+}
+
+/// The origin that the header's comments tell, or zero.
+fn origin(path: &Path, header: &Header) -> Result<[f64; 3], SceneFileError> {
+    let words = |comment: &str| comment.split_whitespace().map(str::to_owned).collect();
+    let mut comments = header.comments.iter().map(|comment| words(comment));
+    let found: Option<Vec<String>> =
+        comments.find(|words: &Vec<String>| words.len() == 4 && words[0] == ORIGIN);
+    let Some(words) = found else {
+        return Ok([0.0; 3]);
+    };
+    let mut origin = [0.0; 3];
+    for (value, word) in origin.iter_mut().zip(&words[1..]) {
+        *value = match word.parse() {
+            Ok(number) if f64::is_finite(number) => number,
+            _ => {
+                return Err(SceneFileError::Header {
+                    path: path.to_path_buf(),
+                    reason: format!(
+                        "comment `{}`: `{word}` is no finite number",
+                        words.join(" ")
+                    ),
+                });
+            }
+        };
+    }
+    Ok(origin)
 }
 
 /// Names of the properties in the order they are written, for a scene of `rest` values `f_rest_*`.
@@ -386,6 +424,7 @@ impl Columns {
 
     fn empty_scene(&self, capacity: usize) -> SplatData {
         SplatData {
+            origin: [0.0; 3],
             means: Vec::with_capacity(capacity),
             log_scales: Vec::with_capacity(capacity),
             quats: Vec::with_capacity(capacity),

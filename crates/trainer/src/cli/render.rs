@@ -83,7 +83,7 @@ pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure>
                 "two cameras would both be written to {stem}.png; rename one"
             )));
         }
-        let camera = camera.tensors(&device);
+        let camera = camera.relative_to(gaussians.origin).tensors(&device);
         for (channel, picture) in pictures(&gaussians, &camera, &settings, &args.channels)? {
             let suffix = match channel {
                 Channel::Rgb => "",

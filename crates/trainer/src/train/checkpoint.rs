@@ -16,7 +16,7 @@ use super::{History, State};
 use crate::report::write_atomically;
 
 /// File format version; a reader refuses others.
-const VERSION: u32 = 1;
+const VERSION: u32 = 2;
 /// Key of the metadata entry that holds everything but tensors.
 const META: &str = "burn_splat";
 
@@ -59,6 +59,7 @@ struct Meta {
     version: u32,
     step: usize,
     elapsed_seconds: f64,
+    origin: [f64; 3],
     /// Parameter ids, by which the optimiser knows its states; as strings, JSON has no u64.
     param_ids: Vec<(String, String)>,
     edits_seen: Vec<usize>,
@@ -91,6 +92,7 @@ impl Checkpoint {
                 version: VERSION,
                 step: state.step,
                 elapsed_seconds: state.elapsed.as_secs_f64(),
+                origin: gaussians.origin,
                 param_ids: param_ids(gaussians),
                 edits_seen: state.edits.iter().map(|log| log.count()).collect(),
                 history: state.history.clone(),
@@ -206,6 +208,7 @@ impl Checkpoint {
         device: &Device,
     ) -> Result<Gaussians, CheckpointError> {
         let gaussians = Gaussians {
+            origin: self.meta.origin,
             means: self.param("means", device)?,
             log_scales: self.param("log_scales", device)?,
             quats: self.param("quats", device)?,

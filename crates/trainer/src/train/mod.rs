@@ -18,7 +18,7 @@ use burn::tensor::{Device, Tensor};
 use splat_model::density::{AdaptiveDensity, RunShape};
 use splat_model::ops::{OpError, SH_DEGREE_MAX};
 use splat_model::{
-    EditLog, Gaussians, InitError, project_gaussians, render_projected, scene_scale,
+    EditLog, Gaussians, InitError, project_gaussians, render_projected, scene_origin, scene_scale,
     splat_optimizer, splats_from_points,
 };
 
@@ -214,7 +214,10 @@ impl TrainerBuilder {
         let mut state = State::new(&self.config, run, &loss);
         let gaussians = match self.resume {
             Some(checkpoint) => checkpoint.restore(&mut state, &device)?,
-            None => first_gaussians(&capture, &self.config, run, &device)?,
+            None => {
+                let origin = scene_origin(&cameras);
+                first_gaussians(&capture, &self.config, run, origin, &device)?
+            }
         };
         if state.history.counts.is_empty() {
             state.history.counts.push((0, gaussians.len()));
@@ -241,19 +244,21 @@ fn first_gaussians(
     capture: &Capture,
     config: &TrainConfig,
     run: RunShape,
+    origin: [f64; 3],
     device: &Device,
 ) -> Result<Gaussians, TrainError> {
     let points = &capture.points;
     let positions: Vec<_> = points
         .iter()
-        .map(|p| p.position.map(|x| x as f32))
+        .map(|p| std::array::from_fn(|axis| (p.position[axis] - origin[axis]) as f32))
         .collect();
     let colors: Vec<_> = points.iter().map(|p| p.color).collect();
     let splats = splats_from_points(&positions, &colors, run.scene_scale, &config.init);
-    let splats = splats.map_err(|source| TrainError::Init {
+    let mut splats = splats.map_err(|source| TrainError::Init {
         capture: capture.root.clone(),
         source,
     })?;
+    splats.origin = origin;
     Ok(Gaussians::from_data(&splats, device))
 }
 
@@ -392,7 +397,9 @@ impl Trainer {
         let step = self.state.step;
         let index = self.capture.split.train[self.views.at(step)];
         let view = &self.capture.views[index];
-        let cameras = camera(view).tensors(&self.device);
+        let cameras = camera(view)
+            .relative_to(self.gaussians.origin)
+            .tensors(&self.device);
         let settings = self.config.render_settings(self.sh_degree(step));
 
         let mut projected = project_gaussians(&self.gaussians, &cameras, &settings)?;

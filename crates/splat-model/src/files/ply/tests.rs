@@ -255,3 +255,19 @@ fn arrays_that_do_not_fit_are_named() {
     bad.sh_degree = 4;
     assert!(write(&file_in(&folder), &bad).is_err());
 }
+
+#[test]
+fn the_origin_survives_and_a_bad_one_is_refused() {
+    let folder = TempDir::new().unwrap();
+    let path = file_in(&folder);
+    let mut scene = scene(3, 0);
+    scene.origin = [4.5e6, -0.1, 1e-300];
+    write(&path, &scene).unwrap();
+    assert_eq!(read(&path).unwrap(), scene);
+
+    let bytes = std::fs::read(&path).unwrap();
+    let at = bytes.windows(7).position(|w| w == b"4500000").unwrap();
+    let spoilt = [&bytes[..at], b"4500x00", &bytes[at + 7..]].concat();
+    let message = error_of(&spoilt).to_string();
+    assert!(message.contains("`4500x00`"), "{message}");
+}

@@ -21,11 +21,18 @@ pub(super) fn describe(path: &Path, scene: &SplatData) -> String {
         let scales = scales.map(f64::from);
         scales[0].max(scales[1]).max(scales[2]) / std::f64::consts::LN_10
     });
-    let positions = || scene.means.iter().map(|mean| mean.map(f64::from));
+    let positions = || {
+        let means = scene.means.iter().map(|mean| mean.map(f64::from));
+        means.map(|mean| std::array::from_fn(|axis| scene.origin[axis] + mean[axis]))
+    };
 
     let mut text = format!("scene {}\n", path.display());
     let _ = writeln!(text, "Gaussians  {}", scene.len());
     let _ = writeln!(text, "SH degree  {}", scene.sh_degree);
+    if scene.origin != [0.0; 3] {
+        let [x, y, z] = scene.origin;
+        let _ = writeln!(text, "origin  {x} {y} {z}");
+    }
     let _ = write!(text, "bounds\n{}", bounds_text(bounds(positions())));
     let _ = write!(
         text,
@@ -96,6 +103,7 @@ mod tests {
     #[test]
     fn a_scene_is_described() {
         let scene = SplatData {
+            origin: [0.0; 3],
             means: vec![[0.0, -1.0, 2.0], [4.0, 1.0, 2.5]],
             log_scales: vec![[-4.0; 3], [0.0, 1.0, 99.0]],
             quats: vec![[0.0; 4], [1.0, 0.0, 0.0, 0.0]],

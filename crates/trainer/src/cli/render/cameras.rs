@@ -106,6 +106,7 @@ impl FileCamera {
 /// `count` cameras on a level circle about the middle of the scene, looking at it. Up is -y, as in the frame of a
 /// camera held upright. The middle is the median of each axis; the circle holds nine tenths of the scene in view.
 pub(super) fn orbit(scene: &SplatData, count: u32) -> Vec<(String, Camera)> {
+    let origin = DVec3::from(scene.origin);
     let middle = DVec3::from_array(std::array::from_fn(|axis| {
         quantile(scene.means.iter().map(|mean| f64::from(mean[axis])), 0.5)
     }));
@@ -121,7 +122,7 @@ pub(super) fn orbit(scene: &SplatData, count: u32) -> Vec<(String, Camera)> {
             let down = DVec3::Y;
             let right = down.cross(forward);
             let rotation = DMat3::from_cols(right, down, forward).transpose();
-            let center = middle - radius * forward;
+            let center = origin + middle - radius * forward;
             let mut viewmat = DMat4::from_mat3(rotation);
             viewmat.w_axis = (-(rotation * center)).extend(1.0);
             let camera = Camera {
