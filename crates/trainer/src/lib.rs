@@ -1,5 +1,7 @@
 //! Captures, the training loop, evaluation, reports, and the `splat` program.
 
+#[cfg(feature = "cpu")]
+pub mod accuracy;
 pub mod capture;
 pub mod cli;
 mod evaluate;

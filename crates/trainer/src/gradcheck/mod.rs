@@ -24,7 +24,7 @@ pub use judge::{FileReport, GroupReport, OutputReport, compare, gate};
 pub use report::{json, table};
 pub use run::{Bug, Computed, run};
 pub use scene::{Array, Inputs, Outputs, Scene};
-pub use thresholds::count_near_thresholds;
+pub use thresholds::{NEAR, Walk, walk};
 
 /// Floating point type that a check runs in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -137,6 +137,6 @@ pub fn check(
     bug: Option<Bug>,
 ) -> Result<FileReport, GradcheckError> {
     let computed = run(&fixture.scene, device, precision, bug)?;
-    let near = count_near_thresholds(&fixture.scene, &computed);
-    Ok(compare(fixture, &computed, precision, near))
+    let walk = walk(&fixture.scene, &computed, NEAR);
+    Ok(compare(fixture, &computed, precision, walk.near_threshold))
 }

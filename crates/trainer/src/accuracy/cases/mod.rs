@@ -1,0 +1,23 @@
+//! The hard cases of splatting, by number.
+
+mod blending;
+mod camera;
+mod colour;
+mod model;
+mod shape;
+
+use super::case::Case;
+
+/// All 38, in the order of their numbers.
+pub fn cases() -> Vec<Case> {
+    let mut cases: Vec<Case> = [
+        blending::CASES.as_slice(),
+        camera::CASES.as_slice(),
+        colour::CASES.as_slice(),
+        model::CASES.as_slice(),
+        shape::CASES.as_slice(),
+    ]
+    .concat();
+    cases.sort_by_key(|case| case.number);
+    cases
+}
