@@ -1,5 +1,6 @@
 //! Captures, the training loop, evaluation, reports, and the `splat` program.
 
+pub mod accuracy;
 pub mod capture;
 pub mod cli;
 mod evaluate;

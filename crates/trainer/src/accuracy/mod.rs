@@ -1,0 +1,3 @@
+//! How far pictures and gradients are from the truth.
+
+pub mod model_error;
