@@ -207,12 +207,15 @@ fn sh_backward_coefficients(
             let at = (c * gaussians + index) * 3;
             let d = Vec3::load(dirs, at);
             let g = Vec3::load(grad_colors, at);
-            basis(d.scale(inverse_length(d)), &mut y, degree);
-            #[unroll]
-            for k in 0..comptime!(functions(degree)) {
-                sums[k * 3] += y[k] * g.x;
-                sums[k * 3 + 1] += y[k] * g.y;
-                sums[k * 3 + 2] += y[k] * g.z;
+            // Of a splat that is not seen nothing is evaluated: were it NaN, zero times it would be too.
+            if g.max_abs() != 0.0f32 {
+                basis(d.scale(inverse_length(d)), &mut y, degree);
+                #[unroll]
+                for k in 0..comptime!(functions(degree)) {
+                    sums[k * 3] += y[k] * g.x;
+                    sums[k * 3 + 1] += y[k] * g.y;
+                    sums[k * 3 + 2] += y[k] * g.z;
+                }
             }
         }
         let first = index * stored as usize * 3;
@@ -246,15 +249,20 @@ fn sh_backward_dirs(
         let inverse = inverse_length(d);
         let v = d.scale(inverse);
         let first = index % gaussians * stored as usize * 3;
-        let mut weights = Array::<f32>::new(comptime!(functions(degree)));
-        #[unroll]
-        for k in 0..comptime!(functions(degree)) {
-            weights[k] = g.dot(Vec3::load(coefficients, first + k * 3));
+        // Of a splat that is not seen nothing is evaluated: were it NaN, zero times it would be too, and reach the camera.
+        if g.max_abs() != 0.0f32 {
+            let mut weights = Array::<f32>::new(comptime!(functions(degree)));
+            #[unroll]
+            for k in 0..comptime!(functions(degree)) {
+                weights[k] = g.dot(Vec3::load(coefficients, first + k * 3));
+            }
+            let h = basis_vjp(v, &weights, degree);
+            h.sub(v.scale(v.dot(h)))
+                .scale(inverse)
+                .store(grad_dirs, index * 3);
+        } else {
+            Vec3::new(0.0f32, 0.0f32, 0.0f32).store(grad_dirs, index * 3);
         }
-        let h = basis_vjp(v, &weights, degree);
-        h.sub(v.scale(v.dot(h)))
-            .scale(inverse)
-            .store(grad_dirs, index * 3);
     }
 }
 

@@ -8,6 +8,7 @@
 mod case;
 mod cases;
 mod measure;
+pub mod model_error;
 mod sketch;
 
 pub use case::Case;
