@@ -113,3 +113,27 @@ hard_cases! {
     case_37_large_sh_eight_bit: 37,
     case_38_relocation: 38,
 }
+
+/// Needles up to 10,000 : 1: determinant to 1e-3, exponent to 1e-2, and nothing visible is culled.
+fn check_projection(backend: &str, device: &Device) {
+    let errors = splat_trainer::accuracy::projection::projection_errors(1_000_000, 1, device)
+        .unwrap_or_else(|error| panic!("{backend}: {error}"));
+    println!("{backend}: {errors:?}");
+    assert!(errors.visible > 500_000, "{errors:?}");
+    assert_eq!(errors.culled_but_visible, 0, "{errors:?}");
+    assert!(errors.determinant <= 1e-3, "{errors:?}");
+    assert!(errors.exponent <= 1e-2, "{errors:?}");
+}
+
+#[test]
+fn a_million_extreme_gaussians_on_cpu() {
+    check_projection("cpu", &Device::flex());
+}
+
+#[cfg(feature = "wgpu")]
+#[test]
+fn a_million_extreme_gaussians_on_wgpu() {
+    if let Some(device) = adapter() {
+        check_projection("wgpu", &device);
+    }
+}

@@ -1,5 +1,7 @@
 //! The `splat` program: arguments, what is printed, exit status. One file per command.
 
+#[cfg(feature = "cpu")]
+mod bench;
 mod device;
 mod eval;
 mod failure;
@@ -31,7 +33,7 @@ struct Cli {
 }
 
 /// Arguments of every command.
-#[derive(Debug, Args)]
+#[derive(Debug, Clone, Args)]
 pub struct GlobalArgs {
     /// Where to compute; auto: a real GPU if there is one, else the CPU
     #[arg(long, global = true, value_enum, default_value_t)]
@@ -51,6 +53,8 @@ enum Command {
     Render(render::RenderArgs),
     Info(info::InfoArgs),
     Gradcheck(GradcheckArgs),
+    #[cfg(feature = "cpu")]
+    Bench(bench::BenchArgs),
 }
 
 /// Runs the program on the process's arguments.
@@ -63,6 +67,8 @@ pub fn main() -> ExitCode {
         Command::Render(args) => render::run(args, global),
         Command::Info(args) => info::run(args, global),
         Command::Gradcheck(args) => gradcheck::run(args, global),
+        #[cfg(feature = "cpu")]
+        Command::Bench(args) => bench::run(args, global),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

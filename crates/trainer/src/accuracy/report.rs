@@ -1,0 +1,366 @@
+//! Error beside time, for every case and backend: as rows, as a Markdown table, and as a picture.
+
+use std::fmt::Write;
+use std::time::Instant;
+
+use burn::tensor::Device;
+use plotters::coord::Shift;
+use plotters::prelude::*;
+use serde::Serialize;
+
+use super::measure::single;
+use super::model_error::{ModelErrorRow, Shape, model_error_table};
+use super::projection::{ProjectionErrors, projection_errors};
+use super::{AccuracyError, Case, cases};
+
+/// Random extreme Gaussians that the projection is measured on.
+const GAUSSIANS: usize = 1_000_000;
+/// Runs of which the median time is taken.
+const RUNS: usize = 5;
+/// Size of the picture in pixels.
+const PICTURE: (u32, u32) = (900, 560);
+
+/// A device and its name.
+pub struct Backend {
+    /// Short: cpu, wgpu.
+    pub name: String,
+    /// The device.
+    pub device: Device,
+}
+
+/// One case on one backend: a point of error against time.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Row {
+    /// Number of the case.
+    pub case: u8,
+    /// Its name.
+    pub name: &'static str,
+    /// Backend.
+    pub backend: String,
+    /// Relative L2 error of the image in single precision.
+    pub forward: f64,
+    /// Relative L2 error of the worst parameter group.
+    pub gradient: f64,
+    /// That group.
+    pub worst_group: String,
+    /// Whether the case's demand holds.
+    pub holds: bool,
+    /// Seconds of forward and backward of the case's scenes, with upload and read-back; absent where nothing is rendered.
+    pub seconds: Option<f64>,
+    /// (Pixel, splat) pairs blended in that time, forward.
+    pub blended: u64,
+    /// Pixels within 1e-6 of a threshold.
+    pub near_threshold: usize,
+    /// What else was found.
+    pub detail: String,
+}
+
+/// Everything that is measured.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Report {
+    /// What it ran on.
+    pub machine: String,
+    /// Cases by number, each on every backend.
+    pub cases: Vec<Row>,
+    /// The projection of extreme Gaussians, per backend.
+    pub projection: Vec<(String, ProjectionErrors)>,
+    /// How far the affine projection is from the 3D model.
+    pub model: Vec<ModelErrorRow>,
+}
+
+impl Report {
+    /// Measures everything; `each` hears of every case before it runs.
+    ///
+    /// # Errors
+    /// When a device or an op refuses what it should take. An inaccurate result is a row that does not hold.
+    pub fn measure(
+        backends: &[Backend],
+        mut each: impl FnMut(&Backend, &Case),
+    ) -> Result<Self, AccuracyError> {
+        let mut rows = vec![];
+        let mut projection = vec![];
+        for case in cases() {
+            for backend in backends {
+                each(backend, &case);
+                rows.push(measure(&case, backend)?);
+            }
+        }
+        for backend in backends {
+            let errors = projection_errors(GAUSSIANS, 1, &backend.device)?;
+            projection.push((backend.name.clone(), errors));
+        }
+        Ok(Self {
+            machine: machine(),
+            cases: rows,
+            projection,
+            model: model_error_table(&Device::flex())
+                .map_err(|error| AccuracyError::Read(error.to_string()))?,
+        })
+    }
+
+    /// Rows whose demand does not hold.
+    pub fn failures(&self) -> impl Iterator<Item = &Row> {
+        self.cases.iter().filter(|row| !row.holds)
+    }
+
+    /// The tables of `docs/ACCURACY.md`.
+    pub fn markdown(&self) -> String {
+        let mut text = String::new();
+        // Writing into a string cannot fail.
+        let _ = self.write_cases(&mut text);
+        let _ = self.write_projection(&mut text);
+        let _ = self.write_model(&mut text);
+        text
+    }
+
+    fn write_cases(&self, text: &mut String) -> std::fmt::Result {
+        writeln!(text, "## Hard cases\n")?;
+        writeln!(
+            text,
+            "Relative L2 error of the image and of the worst parameter group, single precision against double; time of one \
+             forward and backward of the case's scenes with upload and read-back.\n"
+        )?;
+        writeln!(
+            text,
+            "| # | case | backend | image | gradient | worst group | ms | blended | holds | |"
+        )?;
+        writeln!(text, "|--:|---|---|--:|--:|---|--:|--:|---|---|")?;
+        for row in &self.cases {
+            let time = row
+                .seconds
+                .map_or(String::new(), |s| format!("{:.1}", 1e3 * s));
+            writeln!(
+                text,
+                "| {} | {} | {} | {:.1e} | {:.1e} | {} | {} | {} | {} | {} |",
+                row.case,
+                row.name,
+                row.backend,
+                row.forward,
+                row.gradient,
+                row.worst_group,
+                time,
+                row.blended,
+                if row.holds { "yes" } else { "**no**" },
+                row.detail.replace('|', "/")
+            )?;
+        }
+        let mut worst: Vec<&Row> = self.cases.iter().collect();
+        worst.sort_by(|a, b| {
+            b.gradient
+                .max(b.forward)
+                .total_cmp(&a.gradient.max(a.forward))
+        });
+        writeln!(text, "\nThe five worst: ")?;
+        for row in worst.iter().take(5) {
+            writeln!(
+                text,
+                "- case {} on {}: image {:.1e}, gradient {:.1e} {}",
+                row.case, row.backend, row.forward, row.gradient, row.worst_group
+            )?;
+        }
+        writeln!(text)
+    }
+
+    fn write_projection(&self, text: &mut String) -> std::fmt::Result {
+        writeln!(text, "## Projection of extreme Gaussians\n")?;
+        writeln!(
+            text,
+            "Random Gaussians with axes of 1e-4 to 1e4 pixels, up to 10,000 : 1, in every direction, quaternions of length 1e-9 \
+             to 1e9.\n"
+        )?;
+        writeln!(
+            text,
+            "| backend | Gaussians | visible | visible but culled | determinant | exponent |"
+        )?;
+        writeln!(text, "|---|--:|--:|--:|--:|--:|")?;
+        for (backend, e) in &self.projection {
+            writeln!(
+                text,
+                "| {backend} | {} | {} | {} | {:.1e} | {:.1e} |",
+                e.gaussians, e.visible, e.culled_but_visible, e.determinant, e.exponent
+            )?;
+        }
+        writeln!(text)
+    }
+
+    fn write_model(&self, text: &mut String) -> std::fmt::Result {
+        writeln!(
+            text,
+            "## Model error: the affine projection against the 3D Gaussian\n"
+        )?;
+        writeln!(
+            text,
+            "No rounding error: both in double precision. Relative L2 error of the alpha of one splat of 9 pixels, affine (EWA) \
+             projection against the 3D Gaussian integrated along every pixel's ray, without the low-pass filter; by distance \
+             in standard deviations and by angle off the optical axis.\n"
+        )?;
+        for shape in [Shape::Sphere, Shape::Needle, Shape::Pancake] {
+            let rows: Vec<_> = self
+                .model
+                .iter()
+                .filter(|row| row.shape == shape && row.pixels == 9.0)
+                .collect();
+            let mut angles: Vec<f64> = rows.iter().map(|row| row.angle).collect();
+            angles.sort_by(f64::total_cmp);
+            angles.dedup();
+            let mut distances: Vec<f64> = rows.iter().map(|row| row.distance).collect();
+            distances.sort_by(f64::total_cmp);
+            distances.dedup();
+            let heads: Vec<String> = angles.iter().map(|angle| format!("{angle}°")).collect();
+            writeln!(text, "| {shape:?}, distance | {} |", heads.join(" | "))?;
+            writeln!(text, "|--:|{}", "--:|".repeat(angles.len()))?;
+            for distance in distances {
+                let cells: Vec<String> = angles
+                    .iter()
+                    .map(|angle| {
+                        let found = rows
+                            .iter()
+                            .find(|r| r.distance == distance && r.angle == *angle);
+                        found.map_or(String::new(), |row| format!("{:.2e}", row.relative_l2))
+                    })
+                    .collect();
+                writeln!(text, "| {distance} | {} |", cells.join(" | "))?;
+            }
+            writeln!(text)?;
+        }
+        Ok(())
+    }
+
+    /// Error against time, both logarithmic: a point per case and backend, labelled with the case's number.
+    ///
+    /// # Errors
+    /// What the drawing library says.
+    pub fn svg(&self) -> Result<String, String> {
+        let mut svg = String::new();
+        {
+            let root = SVGBackend::with_string(&mut svg, PICTURE).into_drawing_area();
+            let text = |error: DrawingAreaErrorKind<_>| error.to_string();
+            root.fill(&WHITE).map_err(text)?;
+            self.draw(&root).map_err(text)?;
+            root.present().map_err(text)?;
+        }
+        Ok(svg)
+    }
+
+    fn draw<'a>(
+        &self,
+        area: &DrawingArea<SVGBackend<'a>, Shift>,
+    ) -> Result<(), DrawingAreaErrorKind<<SVGBackend<'a> as DrawingBackend>::ErrorType>> {
+        /// An error of zero has no logarithm.
+        const LEAST: f64 = 1e-9;
+        let points: Vec<(&Row, f64, f64)> = self
+            .cases
+            .iter()
+            .filter_map(|row| {
+                let error = row.gradient.max(row.forward).max(LEAST);
+                (error.is_finite()).then_some((row, 1e3 * row.seconds?, error))
+            })
+            .collect();
+        let range = |values: &mut dyn Iterator<Item = f64>| {
+            values.fold((f64::INFINITY, f64::NEG_INFINITY), |r, v| {
+                (r.0.min(v), r.1.max(v))
+            })
+        };
+        let (first, last) = range(&mut points.iter().map(|p| p.1));
+        if !(first > 0.0 && last.is_finite()) {
+            return Ok(());
+        }
+        let (least, most) = range(&mut points.iter().map(|p| p.2));
+        let mut chart = ChartBuilder::on(area)
+            .caption(
+                "Error against time: hard cases, forward and backward",
+                ("sans-serif", 18),
+            )
+            .margin(10)
+            .x_label_area_size(40)
+            .y_label_area_size(70)
+            .build_cartesian_2d(
+                (first / 1.5..last * 1.5).log_scale(),
+                (least / 2.0..most.max(1e-3) * 2.0).log_scale(),
+            )?;
+        chart
+            .configure_mesh()
+            .x_desc("milliseconds")
+            .y_desc("worst relative L2 error, single against double")
+            .y_label_formatter(&|error| format!("{error:.0e}"))
+            .x_label_formatter(&|ms| format!("{ms}"))
+            .light_line_style(BLACK.mix(0.05))
+            .draw()?;
+        chart
+            .draw_series(LineSeries::new(
+                [(first / 1.5, 1e-3), (last * 1.5, 1e-3)],
+                RED.mix(0.6),
+            ))?
+            .label("gate of hard cases")
+            .legend(|(x, y)| PathElement::new([(x, y), (x + 16, y)], RED.mix(0.6)));
+        let mut backends: Vec<&str> = self.cases.iter().map(|row| row.backend.as_str()).collect();
+        backends.dedup();
+        backends.sort_unstable();
+        backends.dedup();
+        for (index, backend) in backends.into_iter().enumerate() {
+            let color = Palette99::pick(index).to_rgba();
+            let own = points.iter().filter(|(row, ..)| row.backend == backend);
+            chart
+                .draw_series(own.map(|(row, time, error)| {
+                    EmptyElement::at((*time, *error))
+                        + Circle::new((0, 0), 4, color.filled())
+                        + Text::new(row.case.to_string(), (6, -6), ("sans-serif", 11))
+                }))?
+                .label(backend)
+                .legend(move |(x, y)| Circle::new((x + 8, y), 4, color.filled()));
+        }
+        chart
+            .configure_series_labels()
+            .background_style(WHITE)
+            .border_style(BLACK.mix(0.3))
+            .draw()?;
+        Ok(())
+    }
+}
+
+fn measure(case: &Case, backend: &Backend) -> Result<Row, AccuracyError> {
+    let outcome = case.measure(&backend.device)?;
+    let scenes = case.timed_scenes();
+    let mut times = vec![];
+    // The first run compiles kernels and warms caches.
+    for run in 0..=RUNS {
+        let start = Instant::now();
+        for scene in &scenes {
+            single(scene, &backend.device)?;
+        }
+        if run > 0 {
+            times.push(start.elapsed().as_secs_f64());
+        }
+    }
+    times.sort_by(f64::total_cmp);
+    Ok(Row {
+        case: case.number,
+        name: case.name,
+        backend: backend.name.clone(),
+        forward: outcome.forward,
+        gradient: outcome.gradient,
+        worst_group: outcome.worst_group,
+        holds: outcome.holds,
+        seconds: (!scenes.is_empty()).then(|| times[RUNS / 2]),
+        blended: outcome.blended,
+        near_threshold: outcome.near_threshold,
+        detail: outcome.detail,
+    })
+}
+
+/// What the figures were measured on, as far as the system says.
+pub fn machine() -> String {
+    let model = std::fs::read_to_string("/proc/cpuinfo")
+        .ok()
+        .and_then(|text| {
+            let line = text.lines().find(|line| line.starts_with("model name"))?;
+            Some(line.split_once(':')?.1.trim().to_owned())
+        });
+    let threads = std::thread::available_parallelism().map_or(1, |n| n.get());
+    format!(
+        "{}, {threads} threads, {} {}",
+        model.unwrap_or_else(|| "unknown processor".to_owned()),
+        std::env::consts::OS,
+        std::env::consts::ARCH
+    )
+}

@@ -1,0 +1,113 @@
+//! `splat bench`: error beside speed.
+
+use std::path::PathBuf;
+
+use clap::{Args, ValueEnum};
+
+use super::{DeviceChoice, Failure, GlobalArgs, device, print};
+use crate::accuracy::report::{Backend, Report};
+use crate::report::metrics::write_json;
+use crate::report::{ReportError, write_atomically};
+
+/// Measure errors beside speed
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  splat bench accuracy
+  splat bench accuracy --device cpu --json accuracy.json
+  splat bench accuracy --report docs
+
+Without --device every backend of this machine is measured: the CPU, and what wgpu finds.
+Exit status: 0 every demand holds, 1 one does not, 2 bad input.")]
+pub struct BenchArgs {
+    /// What to measure
+    #[arg(value_enum, default_value = "accuracy", value_name = "NAME")]
+    pub names: Vec<Bench>,
+    /// Also write the figures as JSON
+    #[arg(long, value_name = "OUT")]
+    pub json: Option<PathBuf>,
+    /// Also write the page ACCURACY.md and its picture accuracy.svg to this folder
+    #[arg(long, value_name = "DIR")]
+    pub report: Option<PathBuf>,
+}
+
+/// What `splat bench` measures.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+pub enum Bench {
+    /// The 38 hard cases: error of image and gradients, and time
+    Accuracy,
+}
+
+/// Runs the command.
+pub(super) fn run(args: &BenchArgs, global: &GlobalArgs) -> Result<(), Failure> {
+    let backends = backends(global)?;
+    let report = Report::measure(&backends, |backend, case| {
+        global.say(format_args!(
+            "case {:>2} on {}: {}",
+            case.number, backend.name, case.name
+        ));
+    })?;
+    print(&report.markdown());
+    if let Some(path) = &args.json {
+        write_json(path, &report)?;
+    }
+    if let Some(folder) = &args.report {
+        write(
+            folder,
+            "accuracy.svg",
+            &report.svg().map_err(Failure::Check)?,
+        )?;
+        write(folder, "ACCURACY.md", &page(&report, &backends))?;
+    }
+    let failed = report.failures().count();
+    if failed > 0 {
+        return Err(Failure::Check(format!(
+            "{failed} demand(s) of the hard cases do not hold"
+        )));
+    }
+    Ok(())
+}
+
+/// The chosen device; or, where none was chosen, all there are.
+fn backends(global: &GlobalArgs) -> Result<Vec<Backend>, Failure> {
+    let one = |choice: DeviceChoice| -> Result<Backend, Failure> {
+        let chosen = device::open(&GlobalArgs {
+            device: choice,
+            ..global.clone()
+        })?;
+        Ok(Backend {
+            name: chosen.name,
+            device: chosen.device,
+        })
+    };
+    match global.device {
+        DeviceChoice::Auto => {
+            let mut all = vec![one(DeviceChoice::Cpu)?];
+            all.extend(one(DeviceChoice::Wgpu).ok());
+            Ok(all)
+        }
+        chosen => Ok(vec![one(chosen)?]),
+    }
+}
+
+fn write(folder: &std::path::Path, name: &str, text: &str) -> Result<(), ReportError> {
+    let path = folder.join(name);
+    write_atomically(&path, text.as_bytes()).map_err(|source| ReportError::Io { path, source })
+}
+
+/// `docs/ACCURACY.md`.
+fn page(report: &Report, backends: &[Backend]) -> String {
+    let names: Vec<&str> = backends
+        .iter()
+        .map(|backend| backend.name.as_str())
+        .collect();
+    format!(
+        "# Accuracy\n\n\
+         Written by `cargo run --release -- bench accuracy --report docs`.\n\n\
+         Machine: {}. Backends: {}. Double precision on the CPU is the reference; it is itself held to PyTorch float64 \
+         within a relative L2 error of 1e-9 on every fixture (`cargo test --release --test gradients`).\n\n\
+         ![error against time](accuracy.svg)\n\n{}",
+        report.machine,
+        names.join(", "),
+        report.markdown()
+    )
+}
