@@ -135,6 +135,9 @@ impl AdaptiveDensity {
         let seen = seen.greater_scalar(0.0).float();
         let length = (screen_gradient * half).square().sum_dim(2).sqrt();
         let length = length.reshape([cameras, n]) * seen.clone();
+        // What is not finite must not hide the other views of the same Gaussian.
+        let finite = length.clone().lower_equal_scalar(f32::MAX);
+        let length = length.mask_fill(finite.bool_not(), 0.0);
         let sum = length.sum_dim(0).reshape([n]);
         let count = seen.sum_dim(0).reshape([n]);
         self.statistics = Some(match self.statistics.take() {
