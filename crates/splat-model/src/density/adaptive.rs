@@ -336,6 +336,23 @@ mod tests {
         assert_eq!((pruned(600), pruned(3_100)), (1, 2));
     }
 
+    #[cfg(feature = "cpu")]
+    #[test]
+    fn a_gradient_that_is_not_finite_does_not_hide_other_views() {
+        let device = burn::tensor::Device::flex();
+        let mut density = AdaptiveDensity::new(AdaptiveSettings::default(), RUN);
+        let size = ImageSize {
+            width: 2,
+            height: 2,
+        };
+        for x in [3.0, f32::NAN, f32::INFINITY, 1.0] {
+            let gradient = Tensor::<3>::from_floats([[[x, 0.0], [2.0, 0.0]]], &device);
+            density.observe(gradient, Tensor::ones([1, 2, 2], &device), size);
+        }
+        let (gradients, views) = density.statistics().unwrap();
+        assert_eq!((gradients, views), (vec![4.0, 8.0], vec![4.0, 4.0]));
+    }
+
     #[test]
     fn milestones_shrink_with_the_run() {
         let run = RunShape {
