@@ -7,14 +7,14 @@ use crate::train::LossRecord;
 const VISITS: usize = 3;
 /// Views are compared with each other where there are at least this many; of fewer none is usual.
 const COMPARABLE: usize = 4;
-/// A view is hard from this multiple of the usual loss on, if that also stands out by [`HARD_SPREAD`]. Hardest views
-/// of real captures have 1.2 to 1.6, in a ring of 9 photos 2.0 beside others of 1.7.
+/// A view is hard from this multiple of the usual loss on, if it also stands out by [`HARD_SPREAD`] and has not fallen
+/// below [`STAYS`]: views that are merely harder than others reach 2.0, but their loss falls.
 const HARD: f64 = 1.75;
 /// Median deviations of the views' losses between a hard view and the usual one.
 const HARD_SPREAD: f64 = 8.0;
 /// The loss rises from this multiple of its least on. Rows that were just split raise it by 1.35 for some steps.
 const RISES: f64 = 1.5;
-/// The loss does not fall from this share of the first on; that of a real capture halves in a hundred steps.
+/// A loss does not fall from this share of the first on; that of a real capture halves in a few hundred steps.
 const STAYS: f64 = 0.9;
 /// Losses are compared where there are at least this many at each time.
 const STEPS: usize = 25;
@@ -86,6 +86,10 @@ impl Course<'_> {
         let hard: Vec<_> = levels
             .iter()
             .filter(|(_, level)| *level > (HARD * usual).max(usual + HARD_SPREAD * spread))
+            .filter(|(view, level)| {
+                let first = self.losses.iter().find(|r| view_at(r.step - 1) == *view);
+                first.is_some_and(|first| *level > STAYS * total(first))
+            })
             .collect();
         Some(Warning::HardViews {
             loss: hard.first()?.1,
@@ -181,6 +185,12 @@ mod tests {
             matches!(&warnings[..], [Warning::HardViews { views, .. }] if views == &["7.png"]),
             "{warnings:?}"
         );
+    }
+
+    #[test]
+    fn a_view_whose_loss_falls_is_not_hard() {
+        let harder = |step| falling(step) * if step % VIEWS == 7 { 3.0 } else { 1.0 };
+        assert_eq!(found(harder), []);
     }
 
     #[test]
