@@ -85,6 +85,9 @@ impl EditLog {
 }
 
 /// Adam for one field of the Gaussians.
+///
+/// A gradient whose square is not finite counts as zero, element by element: as if the view had not seen that
+/// Gaussian. Once in the moments it would stay there and make the parameter NaN, or stop it for good.
 #[derive(Debug, Clone)]
 pub struct SplatAdam {
     /// Decay of the first moment.
@@ -166,6 +169,7 @@ impl Optimizer for SplatAdam {
         grad: Tensor<D>,
         state: Option<Self::State<D>>,
     ) -> (Tensor<D>, Option<Self::State<D>>) {
+        let grad = usable(grad);
         let mut state = match state {
             Some(mut state) => {
                 for edit in self.edits.take_since(state.edits_seen) {
@@ -209,10 +213,43 @@ impl Optimizer for SplatAdam {
     }
 }
 
+/// The gradient, with zeros where its square is not finite.
+fn usable<const D: usize>(grad: Tensor<D>) -> Tensor<D> {
+    // On the CPU one number tells, for a fraction of the time of the rest, that there is nothing to do. Elsewhere
+    // reading it would make the device wait.
+    #[cfg(feature = "cpu")]
+    if grad.device() == Device::flex() {
+        let shape = grad.dims();
+        // The step needs it contiguous anyway, so this copies nothing more.
+        let flat = grad.reshape([1, -1]);
+        let finite = all_finite(&flat);
+        let grad = flat.reshape(shape);
+        return if finite { grad } else { masked(grad) };
+    }
+    masked(grad)
+}
+
+fn masked<const D: usize>(grad: Tensor<D>) -> Tensor<D> {
+    let finite = grad.clone().square().lower_equal_scalar(f32::MAX);
+    grad.mask_fill(finite.bool_not(), 0.0)
+}
+
+/// Whether the sum of squares of a row `[1, n]` is finite.
+#[cfg(feature = "cpu")]
+fn all_finite(row: &Tensor<2>) -> bool {
+    let energy = row.clone().matmul(row.clone().transpose());
+    energy
+        .into_data()
+        .convert::<f32>()
+        .as_slice::<f32>()
+        .is_ok_and(|sum| sum[0].is_finite())
+}
+
 #[cfg(all(test, feature = "cpu"))]
 mod tests {
     use super::*;
     use burn::optim::AdamConfig;
+    use burn::tensor::TensorData;
 
     fn values(tensor: Tensor<2>) -> Vec<f32> {
         tensor.into_data().try_into_vec().unwrap()
@@ -241,6 +278,39 @@ mod tests {
         for (a, b) in values(a).into_iter().zip(values(b)) {
             assert!((a - b).abs() <= 1e-6 * b.abs().max(1.0), "{a} {b}");
         }
+    }
+
+    #[test]
+    fn gradients_that_are_not_finite_leave_no_trace() {
+        let device = Device::flex();
+        let adam = SplatAdam::new(EditLog::default());
+        let start = Tensor::<2>::from_floats([[1.0, -2.0], [0.5, 3.0], [0.0, 0.1]], &device);
+        let spoiled = [
+            (0, f32::NAN),
+            (1, f32::INFINITY),
+            (2, f32::NEG_INFINITY),
+            (3, 1e20),
+        ];
+        let run = |spoil: &dyn Fn(usize, &mut [f32])| {
+            let (mut tensor, mut state) = (start.clone(), None);
+            for step in 0..20 {
+                let mut grad = values(gradient(step, &device));
+                spoil(step, &mut grad);
+                let grad = Tensor::from_data(TensorData::new(grad, [3, 2]), &device);
+                (tensor, state) = adam.step(0.01, tensor, grad, state);
+            }
+            values(tensor)
+        };
+        let with = |value: fn(f32) -> f32| {
+            run(&move |step, grad| {
+                if let Some((row, bad)) = spoiled.iter().find(|(row, _)| step == 3 * row + 2) {
+                    grad[*row] = value(*bad);
+                }
+            })
+        };
+        let ended = with(|bad| bad);
+        assert_eq!(ended, with(|_| 0.0));
+        assert!(ended.iter().all(|x| x.is_finite()), "{ended:?}");
     }
 
     #[test]

@@ -83,6 +83,19 @@ impl Default for LearningRates {
 }
 
 impl LearningRates {
+    /// The rates by name, and how many times its default each is.
+    pub fn factors(&self) -> [(&'static str, f64); 6] {
+        let default = Self::default();
+        [
+            ("means", self.means / default.means),
+            ("scales", self.scales / default.scales),
+            ("quats", self.quats / default.quats),
+            ("opacities", self.opacities / default.opacities),
+            ("sh0", self.sh0 / default.sh0),
+            ("sh_rest", self.sh_rest / default.sh_rest),
+        ]
+    }
+
     /// The rates at a step (from 0) of a run of `steps`, for Burn's module optimiser.
     pub fn at(&self, step: usize, steps: usize, scene_scale: f64) -> ModuleLearningRate {
         let progress = step as f64 / steps.max(1) as f64;

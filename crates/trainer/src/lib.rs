@@ -11,4 +11,4 @@ pub mod train;
 
 pub use capture::{Capture, CaptureOptions};
 pub use evaluate::{Scores, ViewScore, evaluate};
-pub use train::{LossTerms, TargetView, TrainConfig, TrainError, Trained, Trainer};
+pub use train::{LossTerms, TargetView, TrainConfig, TrainError, Trained, Trainer, Warning};

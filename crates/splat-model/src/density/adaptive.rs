@@ -135,6 +135,9 @@ impl AdaptiveDensity {
         let seen = seen.greater_scalar(0.0).float();
         let length = (screen_gradient * half).square().sum_dim(2).sqrt();
         let length = length.reshape([cameras, n]) * seen.clone();
+        // What is not finite must not hide the other views of the same Gaussian.
+        let finite = length.clone().lower_equal_scalar(f32::MAX);
+        let length = length.mask_fill(finite.bool_not(), 0.0);
         let sum = length.sum_dim(0).reshape([n]);
         let count = seen.sum_dim(0).reshape([n]);
         self.statistics = Some(match self.statistics.take() {
@@ -332,6 +335,23 @@ mod tests {
         let density = AdaptiveDensity::new(AdaptiveSettings::default(), RUN);
         let pruned = |step| density.plan(step, &splats, &[0.0; 4]).1.pruned;
         assert_eq!((pruned(600), pruned(3_100)), (1, 2));
+    }
+
+    #[cfg(feature = "cpu")]
+    #[test]
+    fn a_gradient_that_is_not_finite_does_not_hide_other_views() {
+        let device = burn::tensor::Device::flex();
+        let mut density = AdaptiveDensity::new(AdaptiveSettings::default(), RUN);
+        let size = ImageSize {
+            width: 2,
+            height: 2,
+        };
+        for x in [3.0, f32::NAN, f32::INFINITY, 1.0] {
+            let gradient = Tensor::<3>::from_floats([[[x, 0.0], [2.0, 0.0]]], &device);
+            density.observe(gradient, Tensor::ones([1, 2, 2], &device), size);
+        }
+        let (gradients, views) = density.statistics().unwrap();
+        assert_eq!((gradients, views), (vec![4.0, 8.0], vec![4.0, 4.0]));
     }
 
     #[test]

@@ -159,7 +159,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     let done = checkpoint.as_ref().map_or(0, Checkpoint::step);
     let progress = Progress::new(config.steps as u64, done as u64, global.quiet);
     let progress = Rc::new(RefCell::new(progress));
-    let shown = Rc::clone(&progress);
+    let [shown, noted] = [&progress, &progress].map(Rc::clone);
     let capture = Arc::new(capture);
     let mut trainer = Trainer::builder()
         .capture(capture.clone())
@@ -168,6 +168,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         .interrupt(interrupt::flag()?)
         .evaluate_every(config.steps.div_ceil(MEASUREMENTS))
         .autosave(AUTOSAVE, save.clone())
+        .on_warning(move |warning| noted.borrow().note(&format!("warning: {warning}")))
         .on_progress(move |state| {
             shown.borrow_mut().update(state.step as u64, || {
                 let loss = state.history.mean_loss(LOSS_WINDOW);

@@ -2,17 +2,22 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::Warning;
+
 /// Everything logged during a run.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
 pub struct History {
     /// Names of the loss's terms.
     pub terms: Vec<String>,
-    /// One entry per step.
+    /// One entry per step whose loss was finite.
     pub losses: Vec<LossRecord>,
     /// Number of Gaussians whenever it changed, and at the beginning.
     pub counts: Vec<(usize, usize)>,
     /// Held-out PSNR in dB, by step, where it was measured.
     pub held_out_psnr: Vec<(usize, f64)>,
+    /// What looked wrong, each thing once.
+    #[serde(default)]
+    pub warnings: Vec<Warning>,
 }
 
 /// The loss of one step.

@@ -6,6 +6,7 @@ mod config;
 mod history;
 mod loss;
 pub(crate) mod views;
+mod warnings;
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -30,6 +31,7 @@ pub use config::TrainConfig;
 pub use history::{History, LossRecord};
 pub use loss::{IntoLoss, LossTerms, TargetView};
 pub use views::{camera, photo};
+pub use warnings::Warning;
 
 /// Why a run could not go on.
 #[derive(Debug, thiserror::Error)]
@@ -57,17 +59,19 @@ pub enum TrainError {
     /// The loss has no term, or does not depend on what was rendered.
     #[error("the loss {0}")]
     Loss(&'static str),
-    /// The loss is NaN or infinite.
+    /// The loss stays NaN or infinite.
     #[error(
-        "step {step}: the loss is {value} on view {view}; lower the learning rates, or look at that photo and its camera"
+        "step {step}: the loss is {value} on view {view}, and was not finite for {in_a_row} steps in a row; lower the learning rates, or look at the photos, their cameras and the loss"
     )]
     NotFinite {
-        /// The step, from 1.
+        /// The last of these steps, from 1.
         step: usize,
-        /// Name of the photo.
+        /// Name of its photo.
         view: String,
-        /// The loss.
+        /// Its loss.
         value: f32,
+        /// How many they are.
+        in_a_row: usize,
     },
 }
 
@@ -86,6 +90,9 @@ pub struct Progress<'a> {
 
 /// Losses are read back from the device in batches of this many steps.
 pub const LOSS_BATCH: usize = 10;
+
+/// A run ends after this many steps in a row without a finite loss: no single photo is the cause then.
+const NOT_FINITE_LIMIT: usize = 100;
 
 /// What a run leaves.
 #[derive(Debug)]
@@ -113,6 +120,7 @@ pub struct TrainerBuilder {
     evaluate_every: Option<usize>,
     autosave: Option<Autosave>,
     on_progress: Box<dyn FnMut(Progress)>,
+    on_warning: Box<dyn FnMut(&Warning)>,
 }
 
 /// Keeps the state of a run from time to time.
@@ -189,6 +197,12 @@ impl TrainerBuilder {
         self
     }
 
+    /// Called when something looks wrong; [`History::warnings`] keeps it too.
+    pub fn on_warning(mut self, callback: impl FnMut(&Warning) + 'static) -> Self {
+        self.on_warning = Box::new(callback);
+        self
+    }
+
     /// Checks everything and makes the first Gaussians.
     ///
     /// # Errors
@@ -233,6 +247,7 @@ impl TrainerBuilder {
             evaluate_every: self.evaluate_every,
             autosave: self.autosave,
             on_progress: self.on_progress,
+            on_warning: self.on_warning,
             gaussians,
             state,
             unread: Vec::new(),
@@ -310,6 +325,7 @@ pub struct Trainer {
     evaluate_every: Option<usize>,
     autosave: Option<Autosave>,
     on_progress: Box<dyn FnMut(Progress)>,
+    on_warning: Box<dyn FnMut(&Warning)>,
     gaussians: Gaussians,
     state: State,
     unread: Vec<UnreadLoss>,
@@ -328,22 +344,34 @@ impl Trainer {
             evaluate_every: None,
             autosave: None,
             on_progress: Box::new(|_| {}),
+            on_warning: Box::new(|_| {}),
         }
     }
 
     /// Runs to the last step, or until interrupted.
     ///
+    /// A gradient that is not finite never reaches the optimiser (see [`SplatAdam`](splat_model::SplatAdam)), so a
+    /// step whose loss is not is a warning, and an error only when many come in a row.
+    ///
     /// # Errors
-    /// When the loss stops being a number, an op refuses what it is given, or a checkpoint cannot be kept.
+    /// When the loss is not finite for 100 steps in a row, or for the whole of a shorter run, an op refuses what it is given, or a checkpoint cannot be kept.
     pub fn run(mut self) -> Result<Trained, TrainError> {
+        if self.state.step == 0 {
+            let found = warnings::start::inspect(&self.capture, &self.gaussians, &self.config);
+            found.into_iter().for_each(|warning| self.warn(warning));
+        }
         while self.state.step < self.config.steps && !self.should_stop() {
             let start = Instant::now();
             self.step()?;
             let last = self.state.step == self.config.steps;
-            if self.unread.len() >= LOSS_BATCH || last {
+            let inspects = warnings::course::is_due(self.state.step, self.config.steps);
+            if self.unread.len() >= LOSS_BATCH || inspects {
                 self.read_losses()?;
             }
             self.state.elapsed += start.elapsed();
+            if inspects {
+                self.inspect_losses();
+            }
             if self
                 .evaluate_every
                 .is_some_and(|every| last || self.state.step.is_multiple_of(every))
@@ -383,7 +411,7 @@ impl Trainer {
         if !self.autosave.as_ref().is_some_and(due) || !self.is_at_rest() {
             return Ok(());
         }
-        // A run whose loss is no longer a number ends here, and the last good checkpoint stays.
+        // The losses up to here are part of the checkpoint.
         self.read_losses()?;
         let checkpoint = Checkpoint::of(&self.gaussians, &self.state)?;
         if let Some(autosave) = &mut self.autosave {
@@ -485,20 +513,50 @@ impl Trainer {
             .iter()
             .zip(values.chunks(1 + self.state.history.terms.len()))
         {
-            if !values[0].is_finite() {
+            if values[0].is_finite() {
+                self.state.history.losses.push(LossRecord {
+                    step: loss.step,
+                    total: values[0],
+                    terms: values[1..].to_vec(),
+                });
+                continue;
+            }
+            let view = self.capture.views[loss.view].name.clone();
+            let last_finite = self.state.history.losses.last();
+            let in_a_row = loss.step - last_finite.map_or(0, |record| record.step);
+            if in_a_row >= NOT_FINITE_LIMIT.min(self.config.steps) {
                 return Err(TrainError::NotFinite {
                     step: loss.step,
-                    view: self.capture.views[loss.view].name.clone(),
+                    view,
                     value: values[0],
+                    in_a_row,
                 });
             }
-            self.state.history.losses.push(LossRecord {
-                step: loss.step,
-                total: values[0],
-                terms: values[1..].to_vec(),
-            });
+            let step = loss.step;
+            self.warn(Warning::LossNotFinite { view, step });
         }
         Ok(())
+    }
+
+    fn inspect_losses(&mut self) {
+        let course = warnings::course::Course {
+            losses: &self.state.history.losses,
+            step: self.state.step,
+            steps: self.config.steps,
+        };
+        let Capture { views, split, .. } = &*self.capture;
+        let mut order = views::ViewOrder::new(self.config.seed, split.train.len());
+        let name = |view: usize| views[split.train[view]].name.clone();
+        let found = course.inspect(split.train.len(), |step| order.at(step), name);
+        found.into_iter().for_each(|warning| self.warn(warning));
+    }
+
+    /// Says what looks wrong, unless it was said before.
+    fn warn(&mut self, warning: Warning) {
+        if let Some(news) = warning.beyond(&self.state.history.warnings) {
+            (self.on_warning)(&news);
+            self.state.history.warnings.push(news);
+        }
     }
 
     fn measure_held_out(&mut self) -> Result<(), TrainError> {
@@ -649,8 +707,78 @@ mod tests {
             .run()
             .unwrap_err();
         assert!(
-            matches!(error, TrainError::NotFinite { step: 1, .. }),
+            matches!(error, TrainError::NotFinite { in_a_row: 100, .. }),
             "{error}"
         );
+    }
+
+    /// A photo whose loss is NaN, whose gradients are too, is passed over; nothing of it stays in the scene or in
+    /// the optimiser.
+    #[test]
+    fn a_photo_without_a_loss_is_named_and_passed_over() {
+        let bad = capture().train_views().nth(3).unwrap().name.clone();
+        let name = bad.clone();
+        let loss = move |view: &TargetView, rendered: &splat_model::ops::Rendered| {
+            let loss = (rendered.image() - view.image.clone()).abs().mean();
+            Ok(if view.name == name {
+                loss * f64::NAN
+            } else {
+                loss
+            })
+        };
+        let said = Rc::new(RefCell::new(Vec::new()));
+        let heard = said.clone();
+        let trained = builder()
+            .loss(loss.clone())
+            .on_warning(move |warning| heard.borrow_mut().push(warning.clone()))
+            .build()
+            .unwrap()
+            .run()
+            .unwrap();
+        assert_eq!(trained.steps, 240);
+        let [Warning::LossNotFinite { view, step }] = &said.borrow()[..] else {
+            panic!("{:?}", said.borrow());
+        };
+        assert_eq!(*view, bad);
+        assert!(*step <= 28, "first seen at step {step}");
+        assert_eq!(trained.history.warnings, *said.borrow());
+        // 240 steps are 8 rounds of 28 views and a part of one.
+        let recorded = trained.history.losses.len();
+        assert!((231..=232).contains(&recorded), "{recorded} losses");
+        let data = trained.gaussians.to_data();
+        let fields = [
+            data.means.as_flattened(),
+            data.log_scales.as_flattened(),
+            data.quats.as_flattened(),
+            &data.opacity_logits,
+            data.sh0.as_flattened(),
+            &data.sh_rest,
+        ];
+        assert!(
+            fields
+                .iter()
+                .all(|field| field.iter().all(|x| x.is_finite()))
+        );
+        let mean = |losses: &[LossRecord]| losses.iter().map(|l| l.total).sum::<f32>();
+        let (first, last) = (
+            &trained.history.losses[..28],
+            &trained.history.losses[recorded - 28..],
+        );
+        assert!(mean(last) < 0.7 * mean(first), "it did not learn");
+
+        // What was said stays with the run, and is not said again.
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("checkpoint.safetensors");
+        trained.checkpoint.save(&path).unwrap();
+        let checkpoint = Checkpoint::load(&path).unwrap();
+        let resumed = builder()
+            .loss(loss)
+            .resume(checkpoint)
+            .on_warning(|warning| panic!("{warning}"))
+            .build()
+            .unwrap()
+            .run()
+            .unwrap();
+        assert_eq!(resumed.history, trained.history);
     }
 }

@@ -1,0 +1,312 @@
+//! What looks wrong with a run: before it, in the capture and the settings, and during it, in the losses.
+//!
+//! A warning stops nothing. Thresholds compare with the other cameras, photos or views, by medians, so that one bad
+//! one stands out and a scene of any size or kind does not.
+
+pub(super) mod course;
+pub(super) mod start;
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+/// Something that looks wrong with a run. `Display` gives one line: what, how much, and what to do.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[non_exhaustive]
+pub enum Warning {
+    /// Many points lie exactly where another one does.
+    CoincidentPoints {
+        /// Number of points whose place is taken.
+        count: usize,
+        /// Number of points.
+        points: usize,
+    },
+    /// Most points lie in a place that is tiny as the cameras see it.
+    CompactPoints {
+        /// Half of the points lie within this of their median, world units.
+        radius: f64,
+        /// Median distance of the cameras, world units.
+        distance: f64,
+    },
+    /// The first Gaussians are so large that one covers most of a picture.
+    LargeGaussians {
+        /// Their median standard deviation, world units.
+        scale: f64,
+        /// Median distance of the cameras, world units.
+        distance: f64,
+        /// `init.scale`.
+        init_scale: f64,
+    },
+    /// Cameras that stand among the points, where the others do not.
+    CamerasInsidePoints {
+        /// Names of their photos.
+        views: Vec<String>,
+        /// From the first of them, the distance within which 1 % of the points lie, world units.
+        near: f64,
+        /// Its median over all cameras.
+        usual: f64,
+    },
+    /// Cameras many times as far from the points as the others.
+    CamerasFarAway {
+        /// Names of their photos.
+        views: Vec<String>,
+        /// Median distance of the points from the first of them, world units.
+        distance: f64,
+        /// Its median over all cameras.
+        usual: f64,
+    },
+    /// Cameras that see almost none of the points.
+    CamerasSeeFewPoints {
+        /// Names of their photos.
+        views: Vec<String>,
+        /// Points that the first of them sees.
+        seen: usize,
+        /// Number of points.
+        points: usize,
+    },
+    /// Photos whose neighbouring pixels have nothing to do with each other.
+    NoisePhotos {
+        /// Their names.
+        views: Vec<String>,
+        /// Number of photos.
+        photos: usize,
+    },
+    /// Learning rates far above the defaults.
+    HighRates {
+        /// Each setting, and how many times its default it is.
+        rates: Vec<(String, f64)>,
+    },
+    /// The loss of a step was NaN or infinite.
+    LossNotFinite {
+        /// Name of the photo.
+        view: String,
+        /// The first such step, from 1.
+        step: usize,
+    },
+    /// Views whose loss stays far above that of the others.
+    HardViews {
+        /// Names of their photos.
+        views: Vec<String>,
+        /// Steps done.
+        step: usize,
+        /// Median loss of the first of them.
+        loss: f64,
+        /// Median loss of all views.
+        usual: f64,
+    },
+    /// The loss rises.
+    LossRises {
+        /// Steps done.
+        step: usize,
+        /// Median loss over the last quarter of the run.
+        loss: f64,
+        /// The least of such medians before.
+        least: f64,
+    },
+    /// The loss has not fallen.
+    LossDoesNotFall {
+        /// Steps done.
+        step: usize,
+        /// Median loss at the beginning.
+        first: f64,
+        /// Median loss over the last quarter of the run.
+        last: f64,
+    },
+}
+
+impl Warning {
+    /// What of it `known` does not say yet: a loss that is not finite is news per photo, hard views are news by
+    /// their names, everything else is news once.
+    pub(super) fn beyond(mut self, known: &[Self]) -> Option<Self> {
+        for other in known {
+            match (&mut self, other) {
+                (Self::HardViews { views, .. }, Self::HardViews { views: named, .. }) => {
+                    views.retain(|view| !named.contains(view));
+                }
+                (Self::LossNotFinite { view, .. }, Self::LossNotFinite { view: named, .. }) => {
+                    if view == named {
+                        return None;
+                    }
+                }
+                (new, old) => {
+                    if core::mem::discriminant(new) == core::mem::discriminant(old) {
+                        return None;
+                    }
+                }
+            }
+        }
+        match &self {
+            Self::HardViews { views, .. } if views.is_empty() => None,
+            _ => Some(self),
+        }
+    }
+}
+
+impl fmt::Display for Warning {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::CoincidentPoints { count, points } => write!(
+                f,
+                "{count} of {points} points lie exactly where another one does; the reconstruction (points3D) looks damaged"
+            ),
+            Self::CompactPoints { radius, distance } => write!(
+                f,
+                "half of the points lie within {radius:.3e} of one place, {distance:.3e} from the cameras; points and cameras seem to differ in scale"
+            ),
+            Self::LargeGaussians {
+                scale,
+                distance,
+                init_scale,
+            } => write!(
+                f,
+                "the first Gaussians are {scale:.3} wide at a distance of {distance:.3}, each covers most of a picture; init.scale is {init_scale} (usually 1), or the points are too few"
+            ),
+            Self::CamerasInsidePoints { views, near, usual } => write!(
+                f,
+                "{}: the camera stands among the points: 1 % of them lie within {near:.3}, usually it is {usual:.3}; remove the photo or correct its pose",
+                Names(views)
+            ),
+            Self::CamerasFarAway {
+                views,
+                distance,
+                usual,
+            } => write!(
+                f,
+                "{}: the camera is {distance:.3} from the points, usually it is {usual:.3}; remove the photo or correct its pose",
+                Names(views)
+            ),
+            Self::CamerasSeeFewPoints {
+                views,
+                seen,
+                points,
+            } => write!(
+                f,
+                "{}: the camera sees {seen} of {points} points; remove the photo or correct its pose (axes: +x right, +y down, +z forward)",
+                Names(views)
+            ),
+            Self::NoisePhotos { views, photos } => write!(
+                f,
+                "{}: of {photos} photos {} look(s) like noise: neighbouring pixels have nothing in common; look at the files",
+                Names(views),
+                views.len()
+            ),
+            Self::HighRates { rates } => {
+                for (index, (rate, factor)) in rates.iter().enumerate() {
+                    let comma = if index > 0 { ", " } else { "" };
+                    let factor = (factor * 100.0).round() / 100.0;
+                    write!(f, "{comma}{rate} is {factor} x its default")?;
+                }
+                write!(f, "; training may not settle, lower the learning rates")
+            }
+            Self::LossNotFinite { view, step } => write!(
+                f,
+                "{view}: at step {step} the loss is not a finite number; gradients that are not finite are left out, look at the photo, its camera and the loss"
+            ),
+            Self::HardViews {
+                views,
+                step,
+                loss,
+                usual,
+            } => write!(
+                f,
+                "{}: after {step} steps the loss is still {loss:.4}, usually it is {usual:.4}; look at the photo and the pose of its camera",
+                Names(views)
+            ),
+            Self::LossRises { step, loss, least } => write!(
+                f,
+                "the loss rises: {loss:.4} after {step} steps, it was {least:.4}; lower the learning rates"
+            ),
+            Self::LossDoesNotFall { step, first, last } => write!(
+                f,
+                "the loss does not fall: {last:.4} after {step} steps, {first:.4} at the beginning; look at the photos, their cameras and the loss"
+            ),
+        }
+    }
+}
+
+/// The first name, and how many there are beside it.
+struct Names<'a>(&'a [String]);
+
+impl fmt::Display for Names<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.0 {
+            [] => write!(f, "no photo"),
+            [only] => write!(f, "{only}"),
+            [first, others @ ..] => write!(f, "{first} and {} other(s)", others.len()),
+        }
+    }
+}
+
+/// The middle value, the upper one of two; NaN of nothing.
+fn median(values: impl IntoIterator<Item = f64>) -> f64 {
+    quantile(values, 0.5)
+}
+
+/// The value below which a share of the values lies; NaN of nothing.
+fn quantile(values: impl IntoIterator<Item = f64>, share: f64) -> f64 {
+    let mut values: Vec<f64> = values.into_iter().collect();
+    if values.is_empty() {
+        return f64::NAN;
+    }
+    let index = ((values.len() as f64 * share) as usize).min(values.len() - 1);
+    *values.select_nth_unstable_by(index, f64::total_cmp).1
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_warning_is_one_line_that_names_photo_and_number() {
+        let warning = Warning::HardViews {
+            views: vec!["a.jpg".into(), "b.jpg".into()],
+            step: 250,
+            loss: 0.5,
+            usual: 0.1,
+        };
+        let text = warning.to_string();
+        assert!(
+            text.starts_with("a.jpg and 1 other(s): after 250 steps"),
+            "{text}"
+        );
+        assert!(text.contains("0.5000") && !text.contains('\n'), "{text}");
+        let warning = Warning::HighRates {
+            rates: vec![("rates.means".into(), 10.0), ("rates.sh0".into(), 7.5)],
+        };
+        let text = warning.to_string();
+        assert!(
+            text.starts_with("rates.means is 10 x its default, rates.sh0 is 7.5 x"),
+            "{text}"
+        );
+    }
+
+    #[test]
+    fn nothing_is_said_twice() {
+        let hard = |views: &[&str]| Warning::HardViews {
+            views: views.iter().map(|view| (*view).to_owned()).collect(),
+            step: 1,
+            loss: 1.0,
+            usual: 0.1,
+        };
+        let lost = |view: &str, step| Warning::LossNotFinite {
+            view: view.to_owned(),
+            step,
+        };
+        let known = [hard(&["a", "b"]), lost("c", 3)];
+        assert_eq!(hard(&["b", "d", "a"]).beyond(&known), Some(hard(&["d"])));
+        assert_eq!(hard(&["b"]).beyond(&known), None);
+        assert_eq!(lost("c", 9).beyond(&known), None);
+        assert_eq!(lost("d", 9).beyond(&known), Some(lost("d", 9)));
+        let points = |count| Warning::CoincidentPoints { count, points: 9 };
+        assert_eq!(points(8).beyond(&known), Some(points(8)));
+        assert_eq!(points(8).beyond(&[points(7)]), None);
+    }
+
+    #[test]
+    fn quantiles_are_values_of_the_list() {
+        let values = [5.0, 1.0, 3.0, 2.0];
+        assert_eq!((median(values), quantile(values, 0.0)), (3.0, 1.0));
+        assert_eq!(quantile(values, 1.0), 5.0);
+        assert!(median([]).is_nan());
+    }
+}

@@ -1,0 +1,211 @@
+//! What looks wrong before the first step: points, cameras, photos, settings.
+
+use std::collections::HashSet;
+
+use glam::DVec3;
+use rayon::prelude::*;
+use splat_model::Gaussians;
+
+use super::{Warning, median, quantile};
+use crate::capture::{Capture, View};
+use crate::train::{TrainConfig, camera};
+
+/// Points that share a place are a warning from this share of all on: matches found twice are a few percent.
+const COINCIDENT: f64 = 0.5;
+/// Half of the points lie within this share of the cameras' distance: under a tenth of a degree, a few pixels of a
+/// photo, where nothing can be seen of them.
+const COMPACT: f64 = 1e-3;
+/// Median standard deviation over the cameras' distance. A splat is visible over about three standard deviations to
+/// either side, at a quarter wider than a picture of 70 degrees; points of real captures give about 0.005.
+const LARGE: f64 = 0.25;
+/// Cameras are compared with each other where there are at least this many; of fewer none is usual.
+const COMPARABLE: usize = 4;
+/// A camera stands among the points where the nearest percent is below this share of its usual distance (real
+/// captures stay above 0.4), and half of the points below [`INSIDE_MIDDLE`] of theirs. A close-up has the first alone;
+/// the cameras in a room neither, being all alike.
+const INSIDE_NEAR: f64 = 0.25;
+/// See [`INSIDE_NEAR`].
+const INSIDE_MIDDLE: f64 = 0.6;
+/// A camera is far away from this multiple of the usual distance on; real captures stay below 1.3.
+const FAR: f64 = 5.0;
+/// A camera sees few points below this share of what is usual; real captures stay above 0.35.
+const FEW: f64 = 0.1;
+/// Correlation of neighbouring pixels, below which a photo is noise: noise has 0 within 0.05, photos of real scenes
+/// 0.6 or more, even at an eighth of their size.
+const NOISE: f64 = 0.2;
+/// So many rows of a photo are enough to tell noise.
+const NOISE_ROWS: u32 = 64;
+/// Rates from this multiple of the default on are high: more than tuning to a scene asks for.
+const HIGH_RATE: f64 = 5.0;
+
+/// Everything that looks wrong.
+pub(in crate::train) fn inspect(
+    capture: &Capture,
+    gaussians: &Gaussians,
+    config: &TrainConfig,
+) -> Vec<Warning> {
+    let positions: Vec<DVec3> = capture
+        .points
+        .iter()
+        .map(|point| DVec3::from_array(point.position))
+        .collect();
+    let outlooks: Vec<Outlook> = capture
+        .views
+        .par_iter()
+        .map(|view| Outlook::of(view, &positions))
+        .collect();
+    let distance = median(outlooks.iter().map(|outlook| outlook.middle));
+    let mut warnings = Vec::new();
+    warnings.extend(crowded(&positions, distance));
+    warnings.extend(large(gaussians, config, distance));
+    warnings.extend(cameras(capture, &outlooks));
+    warnings.extend(noise(&capture.views));
+    warnings.extend(high_rates(config));
+    warnings
+}
+
+/// Where the points are, as one camera has them.
+struct Outlook {
+    /// Distance within which 1 % of the points lie.
+    near: f64,
+    /// Distance within which half of the points lie.
+    middle: f64,
+    /// Number of points that fall into the photo.
+    seen: usize,
+}
+
+impl Outlook {
+    fn of(view: &View, positions: &[DVec3]) -> Self {
+        let center = camera(view).position();
+        let distances: Vec<f64> = positions.iter().map(|p| p.distance(center)).collect();
+        let seen = |position: &&DVec3| {
+            let ([x, y], depth) = view.project(position.to_array());
+            let inside = |at: f64, side: u32| at > 0.0 && at < f64::from(side);
+            depth > 0.0 && inside(x, view.width) && inside(y, view.height)
+        };
+        Self {
+            near: quantile(distances.iter().copied(), 0.01),
+            middle: median(distances),
+            seen: positions.iter().filter(seen).count(),
+        }
+    }
+}
+
+fn crowded(positions: &[DVec3], distance: f64) -> Option<Warning> {
+    let points = positions.len();
+    // As the model has them, in single precision.
+    let places: HashSet<_> = positions
+        .iter()
+        .map(|p| p.as_vec3().to_array().map(f32::to_bits))
+        .collect();
+    let count = points - places.len();
+    if count as f64 >= COINCIDENT * points as f64 {
+        return Some(Warning::CoincidentPoints { count, points });
+    }
+    let axis = |get: fn(&DVec3) -> f64| median(positions.iter().map(get));
+    let middle = DVec3::new(axis(|p| p.x), axis(|p| p.y), axis(|p| p.z));
+    let radius = median(positions.iter().map(|p| p.distance(middle)));
+    // One point or two have no extent to judge.
+    (points > 2 && radius < COMPACT * distance)
+        .then_some(Warning::CompactPoints { radius, distance })
+}
+
+fn large(gaussians: &Gaussians, config: &TrainConfig, distance: f64) -> Option<Warning> {
+    let log_scales = gaussians.to_data().log_scales;
+    let largest = |scales: &[f32; 3]| f64::from(scales.iter().copied().fold(f32::MIN, f32::max));
+    let scale = median(log_scales.iter().map(largest)).exp();
+    (scale > LARGE * distance).then_some(Warning::LargeGaussians {
+        scale,
+        distance,
+        init_scale: config.init.scale,
+    })
+}
+
+/// Each odd camera once: for where it stands, or else for what it sees.
+fn cameras(capture: &Capture, outlooks: &[Outlook]) -> Vec<Warning> {
+    if outlooks.len() < COMPARABLE {
+        return Vec::new();
+    }
+    let points = capture.points.len();
+    let usual = |get: fn(&Outlook) -> f64| median(outlooks.iter().map(get));
+    let usual_near = usual(|outlook| outlook.near);
+    let usual_middle = usual(|outlook| outlook.middle);
+    let usual_seen = usual(|outlook| outlook.seen as f64);
+    let inside =
+        |o: &Outlook| o.near < INSIDE_NEAR * usual_near && o.middle < INSIDE_MIDDLE * usual_middle;
+    let far = |o: &Outlook| o.middle > FAR * usual_middle;
+    let few = |o: &Outlook| o.seen == 0 || (o.seen as f64) < FEW * usual_seen;
+
+    let find = |odd: &dyn Fn(&Outlook) -> bool| {
+        let found: Vec<usize> = (0..outlooks.len()).filter(|i| odd(&outlooks[*i])).collect();
+        let first = found.first().map(|first| &outlooks[*first])?;
+        let name = |index: &usize| capture.views[*index].name.clone();
+        Some((found.iter().map(name).collect(), first))
+    };
+    let mut warnings = Vec::new();
+    warnings.extend(find(&inside).map(|(views, first)| {
+        let (near, usual) = (first.near, usual_near);
+        Warning::CamerasInsidePoints { views, near, usual }
+    }));
+    warnings.extend(find(&far).map(|(views, first)| Warning::CamerasFarAway {
+        views,
+        distance: first.middle,
+        usual: usual_middle,
+    }));
+    let only_few = |o: &Outlook| few(o) && !inside(o) && !far(o);
+    warnings.extend(find(&only_few).map(|(views, first)| {
+        let seen = first.seen;
+        Warning::CamerasSeeFewPoints {
+            views,
+            seen,
+            points,
+        }
+    }));
+    warnings
+}
+
+fn noise(views: &[View]) -> Option<Warning> {
+    let noisy: Vec<bool> = views.par_iter().map(is_noise).collect();
+    let names = views.iter().zip(noisy).filter(|(_, noisy)| *noisy);
+    let noisy: Vec<String> = names.map(|(view, _)| view.name.clone()).collect();
+    (!noisy.is_empty()).then_some(Warning::NoisePhotos {
+        views: noisy,
+        photos: views.len(),
+    })
+}
+
+/// Whether neighbours in a row of the photo's green channel are uncorrelated. A photo of one colour is not noise.
+fn is_noise(view: &View) -> bool {
+    let width = view.width as usize;
+    let every = (view.height / NOISE_ROWS).max(1) as usize;
+    let rows: Vec<Vec<f64>> = view
+        .image
+        .chunks_exact(3 * width)
+        .step_by(every)
+        .map(|row| row.chunks_exact(3).map(|rgb| f64::from(rgb[1])).collect())
+        .collect();
+    let count = (rows.len() * width) as f64;
+    let mean = rows.iter().flatten().sum::<f64>() / count;
+    let variance = rows
+        .iter()
+        .flatten()
+        .map(|x| (x - mean).powi(2))
+        .sum::<f64>()
+        / count;
+    let pairs = rows.iter().flat_map(|row| row.windows(2));
+    let covariance = pairs.map(|p| (p[0] - mean) * (p[1] - mean)).sum::<f64>()
+        / (rows.len() * (width - 1)) as f64;
+    // Half a level of 8 bits: less is a flat photo and its rounding.
+    variance > 0.25 && covariance < NOISE * variance
+}
+
+fn high_rates(config: &TrainConfig) -> Option<Warning> {
+    let rates: Vec<(String, f64)> = config
+        .rates
+        .factors()
+        .into_iter()
+        .filter(|(_, factor)| *factor >= HIGH_RATE)
+        .map(|(name, factor)| (format!("rates.{name}"), factor))
+        .collect();
+    (!rates.is_empty()).then_some(Warning::HighRates { rates })
+}
