@@ -169,7 +169,6 @@ impl Optimizer for SplatAdam {
         grad: Tensor<D>,
         state: Option<Self::State<D>>,
     ) -> (Tensor<D>, Option<Self::State<D>>) {
-        let grad = usable(grad);
         let mut state = match state {
             Some(mut state) => {
                 for edit in self.edits.take_since(state.edits_seen) {
@@ -211,38 +210,6 @@ impl Optimizer for SplatAdam {
         state.moment_2 = state.moment_2.to_device(device);
         state
     }
-}
-
-/// The gradient, with zeros where its square is not finite.
-fn usable<const D: usize>(grad: Tensor<D>) -> Tensor<D> {
-    // On the CPU one number tells, for a fraction of the time of the rest, that there is nothing to do. Elsewhere
-    // reading it would make the device wait.
-    #[cfg(feature = "cpu")]
-    if grad.device() == Device::flex() {
-        let shape = grad.dims();
-        // The step needs it contiguous anyway, so this copies nothing more.
-        let flat = grad.reshape([1, -1]);
-        let finite = all_finite(&flat);
-        let grad = flat.reshape(shape);
-        return if finite { grad } else { masked(grad) };
-    }
-    masked(grad)
-}
-
-fn masked<const D: usize>(grad: Tensor<D>) -> Tensor<D> {
-    let finite = grad.clone().square().lower_equal_scalar(f32::MAX);
-    grad.mask_fill(finite.bool_not(), 0.0)
-}
-
-/// Whether the sum of squares of a row `[1, n]` is finite.
-#[cfg(feature = "cpu")]
-fn all_finite(row: &Tensor<2>) -> bool {
-    let energy = row.clone().matmul(row.clone().transpose());
-    energy
-        .into_data()
-        .convert::<f32>()
-        .as_slice::<f32>()
-        .is_ok_and(|sum| sum[0].is_finite())
 }
 
 #[cfg(all(test, feature = "cpu"))]

@@ -22,6 +22,8 @@ pub struct AdamStep {
 /// `m = beta_1 m + (1 - beta_1) g`, `v = beta_2 v + (1 - beta_2) g^2`,
 /// `p = p - rate m / (sqrt(v) + epsilon)`. One pass over memory on the CPU. Not differentiable.
 ///
+/// A gradient whose square is not finite counts as zero: one NaN would stay in the moments for good.
+///
 /// # Panics
 /// Where the shapes differ.
 pub fn adam_step<const D: usize>(

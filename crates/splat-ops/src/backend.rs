@@ -3,7 +3,10 @@
 
 use core::fmt::Debug;
 
-use burn::backend::{Backend, ExtensionType, backend_extension, tensor::FloatTensor};
+use burn::backend::{
+    Backend, ExtensionType, TensorMetadata, backend_extension, get_or_init_device_settings,
+    tensor::FloatTensor,
+};
 // The expansion of `#[backend_extension]` names these.
 #[allow(unused_imports)]
 use burn::backend::{Autodiff, Dispatch};
@@ -101,6 +104,11 @@ pub trait SplatBackend: Backend {
                 Self::float_mul_scalar(fresh, (1.0 - beta).into()),
             )
         };
+        // A gradient whose square is not finite counts as zero. Written so that NaN fails the comparison.
+        let square = Self::float_mul(grad.clone(), grad.clone());
+        let bools = get_or_init_device_settings::<Self>(&square.device()).bool_dtype;
+        let usable = Self::float_lower_equal_elem(square, f32::MAX.into(), bools);
+        let grad = Self::float_mask_fill(grad, Self::bool_not(usable), 0.0.into());
         let square = Self::float_mul(grad.clone(), grad.clone());
         let moment_1 = decay(moment_1, step.beta_1, grad);
         let moment_2 = decay(moment_2, step.beta_2, square);

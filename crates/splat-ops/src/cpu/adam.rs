@@ -38,8 +38,10 @@ pub(super) fn step<T: Real>(
             let (param, grad) = (&param[range.clone()], &grad[range.clone()]);
             let (moment_1, moment_2) = (&moment_1[range.clone()], &moment_2[range]);
             for i in 0..out_param.len() {
-                let m = moment_1[i] * beta_1 + grad[i] * rest_1;
-                let v = moment_2[i] * beta_2 + grad[i] * grad[i] * rest_2;
+                let usable = (grad[i] * grad[i]).is_finite();
+                let g = if usable { grad[i] } else { T::ZERO };
+                let m = moment_1[i] * beta_1 + g * rest_1;
+                let v = moment_2[i] * beta_2 + g * g * rest_2;
                 out_1[i] = m;
                 out_2[i] = v;
                 out_param[i] = param[i] - m / (v.sqrt() + epsilon) * rate;
