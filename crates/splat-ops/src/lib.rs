@@ -37,7 +37,7 @@ mod spherical_harmonics;
 
 pub use adam::{AdamStep, adam_step};
 pub use blur::gaussian_blur;
-pub use error::OpError;
+pub use error::{ErrorSlot, OpError};
 pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};
 pub use settings::{ImageSize, ProjectSettings, RasterizeSettings};

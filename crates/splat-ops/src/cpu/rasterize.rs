@@ -41,6 +41,17 @@ pub struct State {
     last: Arc<Vec<u32>>,
 }
 
+impl State {
+    /// Of an image that was not rendered: no camera has a list, and no gradient anything in it.
+    fn none<T: Real>() -> Self {
+        Self {
+            lists: Arc::default(),
+            transmittance: tensor(Vec::<T>::new(), [0, 0, 0]),
+            last: Arc::default(),
+        }
+    }
+}
+
 /// A splat as the pixels of a tile see it.
 struct Splat<'a, T> {
     footprint: Footprint<T>,
@@ -241,7 +252,14 @@ pub(super) fn forward<T: Real>(
 
     for index in 0..c {
         let camera = inputs.camera::<T>(index, args);
-        let camera_lists = TileLists::new(camera.packed, camera.opacities, args);
+        let camera_lists = match TileLists::new(camera.packed, camera.opacities, args) {
+            Ok(lists) => lists,
+            Err(error) => {
+                args.errors.report(error);
+                let black = vec![T::ZERO; image.len()];
+                return (tensor(black, [c, h, w, d + 1]), State::none::<T>());
+            }
+        };
         let pixels = index * h * w..(index + 1) * h * w;
         let image = &mut image[pixels.start * (d + 1)..pixels.end * (d + 1)];
         image

@@ -5,7 +5,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
 use crate::{
-    ImageSize, ProjectSettings, RasterizeSettings, gaussian_blur, project, rasterize,
+    ImageSize, OpError, ProjectSettings, RasterizeSettings, gaussian_blur, project, rasterize,
     spherical_harmonics,
 };
 
@@ -174,6 +174,44 @@ fn kernels_agree_with_the_native_path_in_images_and_all_gradients() {
         // Both are f32: within the 1e-4 that each keeps to float64.
         assert!(error <= 1e-4, "{name}: relative L2 {error:e}");
     }
+}
+
+#[test]
+fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
+    if !has_adapter() {
+        return;
+    }
+    // 12,000 splats over each of 4096 x 4 tiles: more than the 195 million pairs that can be listed.
+    let n = 12_000;
+    let size = ImageSize {
+        width: 65_536,
+        height: 64,
+    };
+    let device = Device::wgpu(DeviceKind::DefaultDevice).autodiff();
+    let full = |values: &[f32]| {
+        let data = TensorData::new(values.repeat(n), [n, values.len()]);
+        Tensor::<2>::from_data(data, &device)
+    };
+    let projected = project(
+        full(&[0.0, 0.0, 1.0]),
+        full(&[1.0, 0.0, 0.0, 0.0]),
+        full(&[1.0, 1.0, 1.0]),
+        Tensor::<2>::eye(4, &device).unsqueeze::<3>(),
+        Tensor::<2>::from_data([[1e7, 1e7, 32_768.0, 32.0]], &device),
+        size,
+        &ProjectSettings::default(),
+    )
+    .unwrap();
+    let colors = full(&[1.0]).require_grad();
+    let opacities = full(&[0.5]).squeeze_dim::<1>(1);
+    let settings = RasterizeSettings::default();
+    let error = rasterize(&projected, colors, opacities, None, &settings).unwrap_err();
+    println!("{error}");
+    let pairs = n as u64 * 4096 * 4;
+    assert!(
+        matches!(error, OpError::TooManyPairs { pairs: found, .. } if found == pairs),
+        "{error:?}"
+    );
 }
 
 /// Prints times; run it by name with `--ignored --nocapture`.
