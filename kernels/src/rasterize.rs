@@ -18,6 +18,7 @@
 
 use cubecl::prelude::*;
 
+use crate::exp::exp_neg;
 use crate::intersect::{Frames, Grid, IntersectError, TILE, TileLists, intersect};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
 use crate::project::PACKED;
@@ -129,7 +130,7 @@ fn sample(shape: Shape, x: f32, y: f32) -> Sample {
     let dy = y - shape.mean_y;
     let z1 = shape.w11 * dx;
     let z2 = fma(shape.w21, dx, shape.w22 * dy);
-    let falloff = f32::exp(-0.5f32 * fma(z2, z2, z1 * z1));
+    let falloff = exp_neg(0.5f32 * fma(z2, z2, z1 * z1));
     Sample {
         dx,
         dy,

@@ -10,7 +10,7 @@ mod intersect;
 mod math;
 mod project;
 mod rasterize;
-mod real;
+pub(crate) mod real;
 mod simd;
 mod spherical_harmonics;
 

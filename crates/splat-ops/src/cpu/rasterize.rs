@@ -108,11 +108,11 @@ impl<'a, T: Real> Splat<'a, T> {
 
     /// (z1, z2, exp(-sigma)) at an offset from the mean.
     #[inline(always)]
-    fn falloff(&self, dx: T, dy: T) -> (T, T, T) {
+    fn falloff<const FMA: bool>(&self, dx: T, dy: T) -> (T, T, T) {
         let z1 = self.footprint.w11 * dx;
         let z2 = self.footprint.w21 * dx + self.footprint.w22 * dy;
         let sigma = T::of(0.5) * (z1 * z1 + z2 * z2);
-        (z1, z2, T::exp_neg(sigma))
+        (z1, z2, T::exp_neg::<FMA>(sigma))
     }
 }
 
@@ -282,7 +282,7 @@ pub(super) fn forward<T: Real>(
 
 vectorized! {
     /// Renders one row of tiles into its part of the image.
-    fn blend_row_of_tiles<T: Real>(
+    fn blend_row_of_tiles<T: Real, const FMA: bool>(
         camera: &Camera<T>,
         lists: &TileLists,
         ty: usize,
@@ -292,7 +292,7 @@ vectorized! {
     ) {
         for tx in 0..camera.grid.columns {
             let (_, splats) = lists.tile(ty * camera.grid.columns + tx);
-            let tile = ForwardTile::blend(camera, splats, tx, ty);
+            let tile = ForwardTile::blend::<FMA>(camera, splats, tx, ty);
             tile.store(camera, tx, ty, image, transmittance, last);
         }
     }
@@ -308,7 +308,7 @@ struct ForwardTile<T> {
 
 impl<T: Real> ForwardTile<T> {
     #[inline(always)]
-    fn blend(camera: &Camera<T>, splats: &[u32], tx: usize, ty: usize) -> Self {
+    fn blend<const FMA: bool>(camera: &Camera<T>, splats: &[u32], tx: usize, ty: usize) -> Self {
         let d = camera.channels;
         let thresholds = Thresholds::<T>::new(camera.args);
         let (columns, rows) = camera.inside(tx, ty);
@@ -340,7 +340,8 @@ impl<T: Real> ForwardTile<T> {
                 let transmittance = &mut tile.transmittance[row];
                 let (last, open) = (&mut tile.last[row], &mut open[row]);
                 for i in 0..TILE {
-                    let (_, _, falloff) = splat.falloff(centres[i] - splat.footprint.mean[0], dy);
+                    let (_, _, falloff) =
+                        splat.falloff::<FMA>(centres[i] - splat.footprint.mean[0], dy);
                     let raw = splat.opacity * falloff;
                     let alpha = thresholds.alpha(raw);
                     let before = transmittance[i];
@@ -490,7 +491,7 @@ pub(super) fn backward<T: Real>(
 
 vectorized! {
     /// Writes the partial gradients of one row of tiles; returns its share of the background's.
-    fn row_of_tiles_backward<T: Real>(
+    fn row_of_tiles_backward<T: Real, const FMA: bool>(
         camera: &Camera<T>,
         lists: &TileLists,
         upstream: &Upstream<T>,
@@ -506,7 +507,7 @@ vectorized! {
                 core::mem::take(&mut partials).split_at_mut(splats.len() * width);
             partials = rest;
             BackwardTile::load(camera, upstream, tx, ty, &mut background)
-                .blend(camera, splats, tx, ty, tile);
+                .blend::<FMA>(camera, splats, tx, ty, tile);
         }
         background
     }
@@ -621,7 +622,7 @@ impl<T: Real> BackwardTile<T> {
     /// d mean = -(w11 dz1 + w21 dz2, w22 dz2)
     /// ```
     #[inline(always)]
-    fn blend(
+    fn blend<const FMA: bool>(
         mut self,
         camera: &Camera<T>,
         splats: &[u32],
@@ -669,7 +670,7 @@ impl<T: Real> BackwardTile<T> {
                 let last = &self.last[row];
                 for i in 0..TILE {
                     let dx = centres[i] - splat.footprint.mean[0];
-                    let (z1, z2, falloff) = splat.falloff(dx, dy);
+                    let (z1, z2, falloff) = splat.falloff::<FMA>(dx, dy);
                     let raw = splat.opacity * falloff;
                     let alpha = thresholds.alpha(raw);
                     let blended = thresholds.seen(raw) & (last[i] > place as u32);

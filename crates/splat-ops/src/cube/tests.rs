@@ -176,6 +176,55 @@ fn kernels_agree_with_the_native_path_in_images_and_all_gradients() {
     }
 }
 
+/// Distance in units in the last place, of positive floats.
+fn ulps(a: f32, b: f32) -> u32 {
+    a.to_bits().abs_diff(b.to_bits())
+}
+
+#[test]
+fn the_exponential_is_that_of_the_native_path() {
+    use crate::cpu::real::Real;
+    use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
+    let mut devices = [DefaultDevice, Cpu]
+        .into_iter()
+        .filter_map(|kind| cubecl::Device::wgpu(kind).ok());
+    let Some(device) = devices.next().filter(|_| has_adapter()) else {
+        return;
+    };
+    let client = device.client();
+    let sigmas: Vec<f32> = (0..=1_600_000).map(|i| i as f32 * 1e-5).collect();
+    let input = splat_kernels::Buffer::from_f32(&client, &sigmas);
+    let kernel = splat_kernels::exp::exp_neg_each(&client, &input)
+        .read_f32(&client)
+        .unwrap();
+    let compare = |native: fn(f32) -> f32| {
+        let pairs = sigmas.iter().zip(&kernel);
+        let distances = pairs.map(|(sigma, kernel)| ulps(native(*sigma), *kernel));
+        let (mut worst, mut different) = (0, 0);
+        for distance in distances {
+            worst = worst.max(distance);
+            different += u32::from(distance > 0);
+        }
+        (worst, different)
+    };
+    let fused = compare(f32::exp_neg::<true>);
+    let plain = compare(f32::exp_neg::<false>);
+    println!("(worst distance in ulp, values that differ): fused {fused:?}, plain {plain:?}");
+    // WGSL leaves it to the device whether its fma is one rounding or two, but not to mix them.
+    assert!(
+        fused.0 == 0 || plain.0 == 0,
+        "fused {fused:?}, plain {plain:?}"
+    );
+    assert!(fused.0.max(plain.0) <= 1);
+    let worst = sigmas
+        .iter()
+        .zip(&kernel)
+        .fold(0.0f64, |worst, (sigma, kernel)| {
+            worst.max((f64::from(*kernel) / (-f64::from(*sigma)).exp() - 1.0).abs())
+        });
+    assert!(worst < 2.5e-7, "relative error {worst:e}");
+}
+
 #[test]
 fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
     if !has_adapter() {
