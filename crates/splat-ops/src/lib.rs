@@ -34,6 +34,8 @@ mod error;
 mod project;
 mod rasterize;
 mod spherical_harmonics;
+#[cfg(all(test, feature = "cpu"))]
+mod tests;
 
 pub use adam::{AdamStep, adam_step};
 pub use blur::gaussian_blur;

@@ -7,7 +7,7 @@ mod project;
 mod rasterize;
 mod spherical_harmonics;
 #[cfg(all(test, feature = "cpu", feature = "wgpu"))]
-mod tests;
+pub(crate) mod tests;
 
 use burn::backend::TensorMetadata;
 use burn::tensor::{DType, Shape};

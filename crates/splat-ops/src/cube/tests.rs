@@ -10,7 +10,7 @@ use crate::{
 };
 
 /// Whether there is a wgpu adapter, a software one included.
-fn has_adapter() -> bool {
+pub(crate) fn has_adapter() -> bool {
     use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
     let found = [DefaultDevice, Cpu]
         .into_iter()
