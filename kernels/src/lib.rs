@@ -21,4 +21,6 @@ pub mod scan;
 pub mod sh;
 pub mod sort;
 
+#[doc(hidden)]
+pub use launch::poison;
 pub use launch::{Buffer, CUBE_UNITS};

@@ -5,6 +5,7 @@
 
 use rayon::prelude::*;
 
+use super::buffer::overwritten;
 use super::real::Real;
 use crate::OpError;
 use crate::backend::PROJECTED_WIDTH;
@@ -259,7 +260,7 @@ impl TileLists {
         let total = tiles[tiles.len() - 1] as usize;
         let mut next = tiles.clone();
         let mut position = Vec::with_capacity(total);
-        let mut splats = vec![0; total];
+        let mut splats = overwritten::<u32>(total);
         let mut owners = order
             .iter()
             .zip(spans.windows(2))

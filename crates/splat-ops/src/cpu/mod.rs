@@ -5,9 +5,11 @@
 
 mod adam;
 mod blur;
-mod buffer;
+pub(crate) mod buffer;
 mod intersect;
 mod math;
+#[cfg(test)]
+pub(crate) mod poison;
 mod project;
 mod rasterize;
 pub(crate) mod real;

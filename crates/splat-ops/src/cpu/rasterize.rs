@@ -17,7 +17,7 @@ use std::sync::Arc;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
-use super::buffer::{Buffer, tensor};
+use super::buffer::{Buffer, overwritten, tensor};
 use super::intersect::{Footprint, Grid, TILE, TileLists};
 use super::real::Real;
 use super::simd::vectorized;
@@ -245,9 +245,9 @@ pub(super) fn forward<T: Real>(
     let inputs = Inputs::new(inputs, background);
     let [c, _, d] = inputs.dims();
     let (w, h) = (args.size.width as usize, args.size.height as usize);
-    let mut image = vec![T::ZERO; c * h * w * (d + 1)];
-    let mut transmittance = vec![T::ONE; c * h * w];
-    let mut last = vec![0; c * h * w];
+    let mut image = overwritten::<T>(c * h * w * (d + 1));
+    let mut transmittance = overwritten::<T>(c * h * w);
+    let mut last = overwritten::<u32>(c * h * w);
     let mut lists = Vec::with_capacity(c);
 
     for index in 0..c {

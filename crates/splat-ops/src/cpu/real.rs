@@ -6,9 +6,12 @@ use core::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
 
 use burn::tensor::Element;
 
+use super::buffer::Overwritten;
+
 /// f32 or f64. Only what the ops need; every method is inlined so that loops over lanes vectorise.
 pub(crate) trait Real:
     Element
+    + Overwritten
     + bytemuck::Pod
     + Copy
     + Debug
