@@ -121,6 +121,14 @@ impl std::error::Error for IntersectError {}
 /// [`MAX_SLOT_VALUES`] floats per instance.
 pub const MAX_INSTANCES: u64 = u32::MAX as u64 / MAX_SLOT_VALUES as u64;
 
+/// The one place that decides how many instances are too many. Asked before any list is allocated.
+fn check_instances(instances: u64) -> Result<usize, IntersectError> {
+    match usize::try_from(instances) {
+        Ok(count) if instances <= MAX_INSTANCES => Ok(count),
+        _ => Err(IntersectError::TooManyInstances(instances)),
+    }
+}
+
 /// The part of a splat that can be seen: the ellipse sigma <= `cut`.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
@@ -376,10 +384,7 @@ pub fn intersect(
     walk(&counts, &none(), &none(), &none(), false);
     let (offsets, instances) =
         exclusive_sum_with_total(client, &counts).map_err(IntersectError::Device)?;
-    if instances > MAX_INSTANCES {
-        return Err(IntersectError::TooManyInstances(instances));
-    }
-    let instances = instances as usize;
+    let instances = check_instances(instances)?;
 
     let keys = Buffer::empty(client, instances);
     let slots = Buffer::empty(client, instances);
@@ -421,4 +426,22 @@ pub fn intersect(
         order,
         offsets,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn instances_are_refused_from_the_first_one_whose_gradients_cannot_be_indexed() {
+        for instances in [0, 1, MAX_INSTANCES] {
+            assert_eq!(check_instances(instances), Ok(instances as usize));
+            assert!(instances * MAX_SLOT_VALUES as u64 <= u64::from(u32::MAX));
+        }
+        for instances in [MAX_INSTANCES + 1, 1 << 31, 1 << 32, (1 << 32) + 5, u64::MAX] {
+            let error = check_instances(instances).unwrap_err();
+            assert_eq!(error, IntersectError::TooManyInstances(instances));
+            assert!(error.to_string().contains(&instances.to_string()));
+        }
+    }
 }

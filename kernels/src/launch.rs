@@ -1,5 +1,7 @@
 //! What every stage shares on the host side: buffers with their length, and how work is folded into workgroups.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use cubecl::prelude::*;
 use cubecl::server::Handle;
 
@@ -10,6 +12,19 @@ pub(crate) const CUBE_UNITS_USIZE: usize = CUBE_UNITS as usize;
 
 /// WebGPU's limit on workgroups along one dimension.
 const MAX_CUBES_PER_DIMENSION: u32 = 65_535;
+
+/// Whether what [`Buffer::empty`] reserves is filled with [`POISONED`].
+static POISON: AtomicBool = AtomicBool::new(false);
+
+/// NaN as a float; as an index, far outside of any buffer.
+const POISONED: u32 = 0x7fc0_0000;
+
+/// For tests, and for the whole process: from now on reserved memory is (or is no longer) full of NaN, so that an
+/// element that a kernel reads but none has written shows in the results.
+#[doc(hidden)]
+pub fn poison(on: bool) {
+    POISON.store(on, Ordering::Relaxed);
+}
 
 /// A device buffer of `len` elements of four bytes each (`f32` or `u32`), contiguous.
 ///
@@ -35,6 +50,12 @@ impl Buffer {
 
     /// Reserves `len` elements, not initialised.
     pub fn empty(client: &Client, len: usize) -> Self {
+        if POISON.load(Ordering::Relaxed) {
+            return Self {
+                handle: client.create_from_slice(u32::as_bytes(&vec![POISONED; len.max(1)])),
+                len,
+            };
+        }
         Self {
             handle: client.empty(len.max(1) * 4),
             len,
@@ -149,6 +170,7 @@ mod tests {
             65_537,
             131_071,
             1 << 24,
+            1 << 31,
             (1 << 31) + 3,
         ] {
             let (x, y) = dims(cubes);

@@ -3,7 +3,7 @@
 //! One file per stage, the forward pass beside its vector-Jacobian product, in the order of the data's way:
 //! [`project`] and [`sh`] (spherical harmonics) turn Gaussians into screen splats and their colours; [`intersect`]
 //! lists which tiles every splat touches, with [`scan`] and [`sort`]; [`rasterize`] blends each tile front to back;
-//! [`blur`] is the window of SSIM. Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous,
+//! [`blur`] is the window of SSIM, [`exp`] our own exponential. Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous,
 //! row-major) and launch kernels without waiting, except where they say so. Sums never use float atomics: the same
 //! input gives the same bits on one device.
 
@@ -11,6 +11,7 @@
 #![allow(clippy::collapsible_if)]
 
 pub mod blur;
+pub mod exp;
 pub mod intersect;
 mod launch;
 mod math;
@@ -20,4 +21,6 @@ pub mod scan;
 pub mod sh;
 pub mod sort;
 
+#[doc(hidden)]
+pub use launch::poison;
 pub use launch::{Buffer, CUBE_UNITS};

@@ -18,6 +18,7 @@
 
 use cubecl::prelude::*;
 
+use crate::exp::exp_neg;
 use crate::intersect::{Frames, Grid, IntersectError, TILE, TileLists, intersect};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
 use crate::project::PACKED;
@@ -129,7 +130,7 @@ fn sample(shape: Shape, x: f32, y: f32) -> Sample {
     let dy = y - shape.mean_y;
     let z1 = shape.w11 * dx;
     let z2 = fma(shape.w21, dx, shape.w22 * dy);
-    let falloff = f32::exp(-0.5f32 * fma(z2, z2, z1 * z1));
+    let falloff = exp_neg(0.5f32 * fma(z2, z2, z1 * z1));
     Sample {
         dx,
         dy,
@@ -138,6 +139,43 @@ fn sample(shape: Shape, x: f32, y: f32) -> Sample {
         falloff,
         raw: shape.opacity * falloff,
     }
+}
+
+/// The one place that decides what becomes of a (pixel, splat) pair; both passes ask it.
+#[derive(CubeType, CubeLaunch, Clone, Copy)]
+#[expand(derive(Clone, Copy))]
+struct Thresholds {
+    alpha_min: f32,
+    alpha_max: f32,
+    transmittance_min: f32,
+}
+
+#[cube]
+impl Thresholds {
+    fn seen(self, raw: f32) -> bool {
+        raw >= self.alpha_min
+    }
+
+    fn alpha(self, raw: f32) -> f32 {
+        min(self.alpha_max, raw)
+    }
+
+    /// At the cap alpha no longer depends on anything.
+    fn capped(self, raw: f32) -> bool {
+        raw >= self.alpha_max
+    }
+
+    fn stops(self, transmittance_after: f32) -> bool {
+        transmittance_after < self.transmittance_min
+    }
+}
+
+fn thresholds(frames: &Frames, settings: &RasterizeSettings) -> ThresholdsLaunch {
+    ThresholdsLaunch::new(
+        frames.alpha_min,
+        settings.alpha_max,
+        settings.transmittance_min,
+    )
 }
 
 /// Copies the shape of `splat` to place `k` of the batch.
@@ -166,8 +204,7 @@ fn rasterize_forward(
     transmittance: &mut [f32],
     walked: &mut [u32],
     grid: Grid,
-    alpha_max: f32,
-    transmittance_min: f32,
+    thresholds: Thresholds,
     channels: u32,
     first_channel: u32,
     #[comptime] width: usize,
@@ -256,10 +293,10 @@ fn rasterize_forward(
             for q in 0..PIXELS_PER_UNIT {
                 let y = (first_y + q as u32 * ROWS_APART) as f32 + 0.5f32;
                 let s = sample(shape, x, y);
-                if open[q] == 1u32 && s.raw >= grid.alpha_min {
-                    let alpha = min(alpha_max, s.raw);
+                if open[q] == 1u32 && thresholds.seen(s.raw) {
+                    let alpha = thresholds.alpha(s.raw);
                     let next = t[q] * (1.0f32 - alpha);
-                    if next < transmittance_min {
+                    if thresholds.stops(next) {
                         open[q] = 0u32;
                         open_pixels -= 1u32;
                     } else {
@@ -338,8 +375,7 @@ pub fn rasterize(
             transmittance.arg(),
             walked.arg(),
             frames.uniforms(),
-            settings.alpha_max,
-            settings.transmittance_min,
+            thresholds(frames, settings),
             inputs.channels as u32,
             first_channel as u32,
             MAX_CHANNELS.min(inputs.channels - first_channel),
@@ -396,7 +432,7 @@ fn rasterize_backward(
     grad_output: &[f32],
     slot_gradients: &mut [f32],
     grid: Grid,
-    alpha_max: f32,
+    thresholds: Thresholds,
     channels: u32,
     first_channel: u32,
     #[comptime] layout: SlotLayout,
@@ -510,8 +546,8 @@ fn rasterize_backward(
                         if entry < last[q] {
                             let y = (first_y + q as u32 * ROWS_APART) as f32 + 0.5f32;
                             let s = sample(shape, x, y);
-                            if s.raw >= grid.alpha_min {
-                                let alpha = min(alpha_max, s.raw);
+                            if thresholds.seen(s.raw) {
+                                let alpha = thresholds.alpha(s.raw);
                                 let clear = 1.0f32 - alpha;
                                 let before = t[q] / clear;
                                 let weight = alpha * before;
@@ -526,7 +562,7 @@ fn rasterize_backward(
                                     }
                                 }
                                 if comptime!(layout.shape) {
-                                    if s.raw < alpha_max {
+                                    if !thresholds.capped(s.raw) {
                                         let g_alpha = before * dot - behind[q] / clear;
                                         let g_sigma = -g_alpha * s.raw;
                                         let g_z1 = g_sigma * s.z1;
@@ -793,7 +829,7 @@ pub fn rasterize_vjp(
                     grad_output.arg(),
                     slot_gradients.arg(),
                     frames.uniforms(),
-                    settings.alpha_max,
+                    thresholds(frames, settings),
                     channels as u32,
                     first_channel as u32,
                     layout,

@@ -68,6 +68,9 @@ pub trait SplatBackend: Backend {
 
     /// Packed splats `[C, N, 9]`, colours `[C, N, D]`, opacities `[C, N]` and background `[C, D]`
     /// to `[C, H, W, D + 1]`, the last channel being alpha.
+    ///
+    /// What goes wrong is reported to `args.errors`; the image is then zero, and the gradients that the state leads to
+    /// are.
     fn rasterize_forward(
         packed: FloatTensor<Self>,
         colors: FloatTensor<Self>,

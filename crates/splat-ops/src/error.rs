@@ -1,8 +1,10 @@
-//! What can be wrong with the inputs of an op.
+//! What can go wrong in an op, and how it gets past Burn's dispatch.
+
+use std::sync::{Arc, OnceLock};
 
 use burn::tensor::DType;
 
-/// An input that an op refuses.
+/// An input that an op refuses, or a device that failed.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum OpError {
     /// A tensor has the wrong shape.
@@ -37,4 +39,43 @@ pub enum OpError {
         /// What is wrong and what is allowed.
         what: String,
     },
+    /// The splats touch more tiles than one call can list.
+    #[error(
+        "{op}: {pairs} pairs of a tile and a splat that touches it; one call can list {limit}. \
+         Render fewer cameras or a smaller image per call, or remove Gaussians: huge ones first"
+    )]
+    TooManyPairs {
+        /// The op.
+        op: &'static str,
+        /// Pairs of a tile and a splat that touches it.
+        pairs: u64,
+        /// How many of them can be listed.
+        limit: u64,
+    },
+    /// The device failed.
+    #[error("{op}: the device failed: {what}")]
+    Device {
+        /// The op.
+        op: &'static str,
+        /// In the device's words.
+        what: String,
+    },
+}
+
+/// Where a backend leaves the error of an op. Burn's dispatch brings back tensors and nothing else,
+/// so the error takes this way round it. Clones share one slot; the first error stays.
+#[derive(Debug, Clone, Default)]
+pub struct ErrorSlot(Arc<OnceLock<OpError>>);
+
+impl ErrorSlot {
+    /// Leaves an error for the op's caller. The tensors that the backend then returns are dropped.
+    pub fn report(&self, error: OpError) {
+        // Only the first one tells what went wrong; what follows from it does not.
+        let _ = self.0.set(error);
+    }
+
+    /// The error, if there was one.
+    pub fn error(&self) -> Option<&OpError> {
+        self.0.get()
+    }
 }

@@ -34,10 +34,12 @@ mod error;
 mod project;
 mod rasterize;
 mod spherical_harmonics;
+#[cfg(all(test, feature = "cpu"))]
+mod tests;
 
 pub use adam::{AdamStep, adam_step};
 pub use blur::gaussian_blur;
-pub use error::OpError;
+pub use error::{ErrorSlot, OpError};
 pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};
 pub use settings::{ImageSize, ProjectSettings, RasterizeSettings};

@@ -6,7 +6,7 @@ use burn::tensor::Tensor;
 use crate::backend::{Background, SplatOps};
 use crate::check::Checker;
 use crate::settings::RasterizeArgs;
-use crate::{OpError, Projected, RasterizeSettings};
+use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
 
 /// An image of D channels and its alpha, as [`rasterize`] returns them.
 #[derive(Debug, Clone)]
@@ -47,7 +47,8 @@ impl Rendered {
 /// mean, inverse Cholesky factor, colour and opacity; depth and extent only order and cull.
 ///
 /// # Errors
-/// When shapes, types or devices do not fit.
+/// When shapes, types or devices do not fit, when the splats touch more tiles than one call can list
+/// ([`OpError::TooManyPairs`]), and when the device fails.
 pub fn rasterize<const DC: usize, const DO: usize>(
     projected: &Projected,
     colors: Tensor<DC>,
@@ -99,6 +100,7 @@ pub fn rasterize<const DC: usize, const DO: usize>(
         )?;
     }
 
+    let errors = ErrorSlot::default();
     let packed = <Dispatch as SplatOps>::rasterize(
         packed.into_dispatch(),
         colors.into_dispatch(),
@@ -110,8 +112,12 @@ pub fn rasterize<const DC: usize, const DO: usize>(
         RasterizeArgs {
             size: projected.image_size(),
             settings: *settings,
+            errors: errors.clone(),
         },
     );
+    if let Some(error) = errors.error() {
+        return Err(error.clone());
+    }
     Ok(Rendered {
         packed: Tensor::from_dispatch(packed),
     })

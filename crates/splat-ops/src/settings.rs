@@ -1,5 +1,7 @@
 //! Sizes and settings of the ops. Every constant of the method is a field here, with its default.
 
+use crate::ErrorSlot;
+
 /// Size of the rendered image in pixels. The centre of pixel (i, j) lies at (i + 0.5, j + 0.5).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ImageSize {
@@ -74,10 +76,12 @@ pub struct ProjectArgs {
 }
 
 /// Everything but tensors that a backend needs to rasterise.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct RasterizeArgs {
     /// Image size.
     pub size: ImageSize,
     /// Settings.
     pub settings: RasterizeSettings,
+    /// For what goes wrong on the way.
+    pub errors: ErrorSlot,
 }

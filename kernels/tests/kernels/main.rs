@@ -2,6 +2,7 @@
 
 mod blur;
 mod device;
+mod exp;
 mod intersect;
 mod project;
 mod rasterize;

@@ -7,7 +7,7 @@ use burn::backend::flex::FlexTensor;
 use burn::tensor::TensorData;
 use rayon::prelude::*;
 
-use super::buffer::Buffer;
+use super::buffer::{Buffer, overwritten};
 use super::real::Real;
 use crate::adam::AdamStep;
 
@@ -26,7 +26,7 @@ pub(super) fn step<T: Real>(
     let (rest_1, rest_2) = (T::of(1.0 - step.beta_1), T::of(1.0 - step.beta_2));
     let (rate, epsilon) = (T::of(step.rate), T::of(step.epsilon));
 
-    let mut out = [(); 3].map(|()| vec![T::ZERO; param.len()]);
+    let mut out = [(); 3].map(|()| overwritten::<T>(param.len()));
     let [out_param, out_1, out_2] = &mut out;
     out_param
         .par_chunks_mut(CHUNK)

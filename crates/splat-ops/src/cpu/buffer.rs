@@ -6,6 +6,38 @@ use burn::tensor::TensorData;
 
 use super::real::Real;
 
+/// Memory for `len` values that are all written before any is read. Tests fill it with NaN first.
+pub(super) fn overwritten<T: Overwritten>(len: usize) -> Vec<T> {
+    #[cfg(test)]
+    if super::poison::is_on() {
+        return vec![T::POISON; len];
+    }
+    vec![T::CLEAR; len]
+}
+
+/// What [`overwritten`] memory holds before it is written.
+pub(crate) trait Overwritten: Copy {
+    /// Zero, which costs nothing: fresh pages are.
+    const CLEAR: Self;
+    /// NaN, or for an index one far outside of any list.
+    #[cfg(test)]
+    const POISON: Self;
+}
+
+macro_rules! overwritten {
+    ($type:ty, $poison:expr) => {
+        impl Overwritten for $type {
+            const CLEAR: Self = 0 as $type;
+            #[cfg(test)]
+            const POISON: Self = $poison;
+        }
+    };
+}
+
+overwritten!(f32, f32::NAN);
+overwritten!(f64, f64::NAN);
+overwritten!(u32, 0x7fc0_0000);
+
 /// A tensor whose elements lie in one row-major slice.
 pub(super) struct Buffer {
     tensor: FlexTensor,

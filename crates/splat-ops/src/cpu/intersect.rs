@@ -5,7 +5,9 @@
 
 use rayon::prelude::*;
 
+use super::buffer::overwritten;
 use super::real::Real;
+use crate::OpError;
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::RasterizeArgs;
 
@@ -14,6 +16,29 @@ pub(super) const TILE: usize = 16;
 
 /// Splats per unit of parallel work.
 const CHUNK: usize = 256;
+
+/// Pairs of a tile and a splat of one camera that can be listed: they are counted in 32 bits.
+const MAX_PAIRS: u64 = u32::MAX as u64;
+
+/// The one place that decides how many pairs are too many. Asked before any list is allocated.
+fn check_pairs(pairs: u64, limit: u64) -> Result<(), OpError> {
+    if pairs <= limit {
+        return Ok(());
+    }
+    Err(OpError::TooManyPairs {
+        op: "rasterize",
+        pairs,
+        limit,
+    })
+}
+
+#[cfg(not(test))]
+fn max_pairs() -> u64 {
+    MAX_PAIRS
+}
+
+#[cfg(test)]
+use tests::max_pairs;
 
 /// The lists of one camera. An instance is one (splat, tile) pair.
 #[derive(Debug, Clone)]
@@ -105,6 +130,19 @@ impl<T: Real> Footprint<T> {
         least <= self.cut
     }
 
+    /// Tiles of the bounding box: at least as many as [`tiles`](Self::tiles) emits.
+    fn tiles_at_most(&self, grid: Grid) -> u64 {
+        let columns = tile_range(self.mean[0], self.half[0], grid.columns).len();
+        let rows = tile_range(self.mean[1], self.half[1], grid.rows).len();
+        columns as u64 * rows as u64
+    }
+
+    fn count_tiles(&self, grid: Grid) -> u64 {
+        let mut count = 0;
+        self.tiles(grid, |_| count += 1);
+        count
+    }
+
     /// Calls `emit` with every tile whose box of pixel centres the ellipse touches, row by row.
     #[inline(always)]
     fn tiles(&self, grid: Grid, mut emit: impl FnMut(u32)) {
@@ -152,19 +190,33 @@ impl Grid {
 
 impl TileLists {
     /// Lists for one camera: packed splats `[N, 9]` and opacities `[N]`.
-    pub(super) fn new<T: Real>(packed: &[T], opacities: &[T], args: &RasterizeArgs) -> Self {
+    pub(super) fn new<T: Real>(
+        packed: &[T],
+        opacities: &[T],
+        args: &RasterizeArgs,
+    ) -> Result<Self, OpError> {
+        let limit = max_pairs();
         let grid = Grid::new(args);
-        let footprint = |n: usize| {
-            let row = &packed[n * PROJECTED_WIDTH..(n + 1) * PROJECTED_WIDTH];
-            Footprint::new(row, opacities[n], args)
-        };
-        let depth = |n: u32| packed[n as usize * PROJECTED_WIDTH + 2].wide();
-
-        let mut order: Vec<u32> = (0..opacities.len())
-            .into_par_iter()
+        let footprints: Vec<Option<Footprint<T>>> = packed
+            .par_chunks_exact(PROJECTED_WIDTH)
+            .zip(opacities)
             .with_min_len(CHUNK)
-            .filter(|n| footprint(*n).is_some())
-            .map(|n| n as u32)
+            .map(|(row, opacity)| Footprint::new(row, *opacity, args))
+            .collect();
+        // The exact count costs as much as the lists do: only where the bounding boxes are too many.
+        let sum = |count: fn(&Footprint<T>, Grid) -> u64| -> u64 {
+            let counts = footprints.par_iter().with_min_len(CHUNK).flatten();
+            counts.map(|footprint| count(footprint, grid)).sum()
+        };
+        if check_pairs(sum(Footprint::tiles_at_most), limit).is_err() {
+            check_pairs(sum(Footprint::count_tiles), limit)?;
+        }
+
+        let depth = |n: u32| packed[n as usize * PROJECTED_WIDTH + 2].wide();
+        let mut order: Vec<u32> = footprints
+            .iter()
+            .zip(0..)
+            .filter_map(|(footprint, n)| footprint.is_some().then_some(n))
             .collect();
         // Ties by index make the order total, so an unstable sort is deterministic.
         order.par_sort_unstable_by(|a, b| depth(*a).total_cmp(&depth(*b)).then(a.cmp(b)));
@@ -176,7 +228,7 @@ impl TileLists {
                 let mut tiles = Vec::with_capacity(4 * chunk.len());
                 let counts = chunk.iter().map(|n| {
                     let before = tiles.len();
-                    if let Some(footprint) = footprint(*n as usize) {
+                    if let Some(footprint) = &footprints[*n as usize] {
                         footprint.tiles(grid, |tile| tiles.push(tile));
                     }
                     (tiles.len() - before) as u32
@@ -208,7 +260,7 @@ impl TileLists {
         let total = tiles[tiles.len() - 1] as usize;
         let mut next = tiles.clone();
         let mut position = Vec::with_capacity(total);
-        let mut splats = vec![0; total];
+        let mut splats = overwritten::<u32>(total);
         let mut owners = order
             .iter()
             .zip(spans.windows(2))
@@ -221,13 +273,13 @@ impl TileLists {
             position.push(*slot);
             *slot += 1;
         }
-        Self {
+        Ok(Self {
             order,
             spans,
             position,
             splats,
             tiles,
-        }
+        })
     }
 
     /// Number of (splat, tile) pairs.
@@ -244,10 +296,147 @@ impl TileLists {
 
 #[cfg(test)]
 mod tests {
+    use core::cell::Cell;
+
     use super::*;
-    use crate::ImageSize;
+    use crate::backend::SplatBackend;
+    use crate::cpu::buffer::tensor;
+    use crate::{ImageSize, ProjectSettings, Projected, RasterizeSettings, project, rasterize};
+    use burn::backend::Flex;
+    use burn::tensor::{Device, Tensor, TensorData};
     use rand::{RngExt, SeedableRng};
     use rand_pcg::Pcg64;
+
+    thread_local! {
+        /// A test on this thread may lower the limit: no test can list 2^32 pairs.
+        static LIMIT: Cell<u64> = const { Cell::new(MAX_PAIRS) };
+    }
+
+    pub(super) fn max_pairs() -> u64 {
+        LIMIT.get()
+    }
+
+    #[test]
+    fn pairs_are_refused_from_the_first_one_that_cannot_be_indexed() {
+        for pairs in [0, 1, 1 << 31, MAX_PAIRS] {
+            assert_eq!(check_pairs(pairs, MAX_PAIRS), Ok(()));
+        }
+        for pairs in [1 << 32, (1 << 32) + 5, 1 << 40, u64::MAX] {
+            let error = check_pairs(pairs, MAX_PAIRS).unwrap_err();
+            let message = error.to_string();
+            assert!(message.contains(&pairs.to_string()), "{message}");
+            assert!(message.contains("4294967295"), "{message}");
+        }
+    }
+
+    /// One long splat across a 48 x 48 image, whose bounding box touches all nine tiles.
+    fn diagonal(device: &Device) -> (Projected, Tensor<2>, Tensor<1>) {
+        let tensor = |values: Vec<f32>, shape: Vec<usize>| TensorData::new(values, shape);
+        let at = |values: Vec<f32>, shape: Vec<usize>| {
+            Tensor::<2>::from_data(tensor(values, shape), device)
+        };
+        let angle = core::f32::consts::FRAC_PI_8;
+        let viewmat = [
+            [1.0, 0.0, 0.0, 0.0],
+            [0.0, 1.0, 0.0, 0.0],
+            [0.0, 0.0, 1.0, 0.0],
+            [0.0, 0.0, 0.0, 1.0],
+        ];
+        let projected = project(
+            at(vec![0.0, 0.0, 1.0], vec![1, 3]),
+            at(vec![angle.cos(), 0.0, 0.0, angle.sin()], vec![1, 4]),
+            at(vec![0.12, 0.005, 0.01], vec![1, 3]),
+            Tensor::<3>::from_data([viewmat], device),
+            at(vec![60.0, 60.0, 24.0, 24.0], vec![1, 4]),
+            ImageSize {
+                width: 48,
+                height: 48,
+            },
+            &ProjectSettings::default(),
+        );
+        let colors = at(vec![1.0], vec![1, 1]);
+        let opacities = Tensor::from_data(tensor(vec![0.9], vec![1]), device);
+        (projected.unwrap(), colors, opacities)
+    }
+
+    #[test]
+    fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
+        for tracked in [false, true] {
+            let device = Device::flex();
+            let device = if tracked { device.autodiff() } else { device };
+            let (projected, mut colors, opacities) = diagonal(&device);
+            if tracked {
+                colors = colors.require_grad();
+            }
+            let render = |limit: u64| {
+                LIMIT.set(limit);
+                let settings = RasterizeSettings::default();
+                let rendered = rasterize(
+                    &projected,
+                    colors.clone(),
+                    opacities.clone(),
+                    None,
+                    &settings,
+                );
+                LIMIT.set(MAX_PAIRS);
+                rendered
+            };
+            let pairs = match render(0) {
+                Err(OpError::TooManyPairs {
+                    pairs, limit: 0, ..
+                }) => pairs,
+                other => panic!("{other:?}"),
+            };
+            // Fewer than the nine tiles of the bounding box: what counts is what would be listed.
+            assert!((3..9).contains(&pairs), "{pairs} pairs");
+            assert!(render(pairs).is_ok());
+            assert_eq!(
+                render(pairs - 1).unwrap_err(),
+                OpError::TooManyPairs {
+                    op: "rasterize",
+                    pairs,
+                    limit: pairs - 1
+                }
+            );
+        }
+    }
+
+    #[test]
+    fn an_image_that_was_not_rendered_is_zero_and_so_are_its_gradients() {
+        let args = RasterizeArgs {
+            size: ImageSize {
+                width: 3,
+                height: 2,
+            },
+            settings: Default::default(),
+            errors: Default::default(),
+        };
+        let row = vec![1.0f32, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 3.0, 3.0];
+        let inputs = || {
+            (
+                tensor(row.clone(), [1, 1, PROJECTED_WIDTH]),
+                tensor(vec![1.0f32], [1, 1, 1]),
+                tensor(vec![0.5f32], [1, 1]),
+                Some(tensor(vec![1.0f32], [1, 1])),
+            )
+        };
+        LIMIT.set(0);
+        let (packed, colors, opacities, background) = inputs();
+        let (image, state) = Flex::rasterize_forward(packed, colors, opacities, background, &args);
+        LIMIT.set(MAX_PAIRS);
+        assert!(args.errors.error().is_some());
+        assert_eq!(image.as_slice::<f32>(), Some(&[0.0; 12][..]));
+
+        let (packed, colors, opacities, background) = inputs();
+        let grad = tensor(vec![1.0f32; 12], [1, 2, 3, 2]);
+        let grads = Flex::rasterize_backward(
+            packed, colors, opacities, background, image, state, grad, &args, [true; 4],
+        );
+        for (grad, length) in grads.iter().zip([PROJECTED_WIDTH, 1, 1, 1]) {
+            let grad = grad.as_ref().and_then(|grad| grad.as_slice::<f32>());
+            assert_eq!(grad, Some(&vec![0.0; length][..]));
+        }
+    }
 
     /// The tile test against brute force over every pixel: no tile that holds a visible pixel may be
     /// missing, and a tile without one may only be listed if its box of pixel centres is touched
@@ -260,6 +449,7 @@ mod tests {
                 height: 61,
             },
             settings: Default::default(),
+            errors: Default::default(),
         };
         let grid = Grid::new(&args);
         let mut rng = Pcg64::seed_from_u64(3);

@@ -5,12 +5,14 @@
 
 mod adam;
 mod blur;
-mod buffer;
+pub(crate) mod buffer;
 mod intersect;
 mod math;
+#[cfg(test)]
+pub(crate) mod poison;
 mod project;
 mod rasterize;
-mod real;
+pub(crate) mod real;
 mod simd;
 mod spherical_harmonics;
 

@@ -21,7 +21,7 @@ use core::marker::PhantomData;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
-use super::buffer::{Buffer, tensor};
+use super::buffer::{Buffer, overwritten, tensor};
 use super::math::*;
 use super::real::Real;
 use crate::backend::PROJECTED_WIDTH;
@@ -411,7 +411,7 @@ pub(super) fn forward<T: Real>(
     let buffers = inputs.map(Buffer::new);
     let inputs = Inputs::<T>::new(&buffers, args);
     let (c, n) = (inputs.cameras.len(), inputs.count());
-    let mut packed = vec![T::ZERO; c * n * PROJECTED_WIDTH];
+    let mut packed = overwritten::<T>(c * n * PROJECTED_WIDTH);
     if n > 0 {
         for (camera, packed) in inputs
             .cameras
@@ -422,10 +422,9 @@ pub(super) fn forward<T: Real>(
                 .par_chunks_mut(PROJECTED_WIDTH)
                 .with_min_len(CHUNK)
                 .enumerate()
-                .for_each(|(n, row)| {
-                    if let Some(splat) = Splat::new(inputs.gaussian(n), camera) {
-                        row.copy_from_slice(&splat.packed);
-                    }
+                .for_each(|(n, row)| match Splat::new(inputs.gaussian(n), camera) {
+                    Some(splat) => row.copy_from_slice(&splat.packed),
+                    None => row.fill(T::ZERO),
                 });
         }
     }

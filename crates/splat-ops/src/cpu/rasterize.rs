@@ -17,7 +17,7 @@ use std::sync::Arc;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
-use super::buffer::{Buffer, tensor};
+use super::buffer::{Buffer, overwritten, tensor};
 use super::intersect::{Footprint, Grid, TILE, TileLists};
 use super::real::Real;
 use super::simd::vectorized;
@@ -39,6 +39,17 @@ pub struct State {
     transmittance: FlexTensor,
     /// `[C, H, W]`: one past the place of the last blended splat in the list of the pixel's tile.
     last: Arc<Vec<u32>>,
+}
+
+impl State {
+    /// Of an image that was not rendered: no camera has a list, and no gradient anything in it.
+    fn none<T: Real>() -> Self {
+        Self {
+            lists: Arc::default(),
+            transmittance: tensor(Vec::<T>::new(), [0, 0, 0]),
+            last: Arc::default(),
+        }
+    }
 }
 
 /// A splat as the pixels of a tile see it.
@@ -97,11 +108,11 @@ impl<'a, T: Real> Splat<'a, T> {
 
     /// (z1, z2, exp(-sigma)) at an offset from the mean.
     #[inline(always)]
-    fn falloff(&self, dx: T, dy: T) -> (T, T, T) {
+    fn falloff<const FMA: bool>(&self, dx: T, dy: T) -> (T, T, T) {
         let z1 = self.footprint.w11 * dx;
         let z2 = self.footprint.w21 * dx + self.footprint.w22 * dy;
         let sigma = T::of(0.5) * (z1 * z1 + z2 * z2);
-        (z1, z2, T::exp_neg(sigma))
+        (z1, z2, T::exp_neg::<FMA>(sigma))
     }
 }
 
@@ -234,14 +245,21 @@ pub(super) fn forward<T: Real>(
     let inputs = Inputs::new(inputs, background);
     let [c, _, d] = inputs.dims();
     let (w, h) = (args.size.width as usize, args.size.height as usize);
-    let mut image = vec![T::ZERO; c * h * w * (d + 1)];
-    let mut transmittance = vec![T::ONE; c * h * w];
-    let mut last = vec![0; c * h * w];
+    let mut image = overwritten::<T>(c * h * w * (d + 1));
+    let mut transmittance = overwritten::<T>(c * h * w);
+    let mut last = overwritten::<u32>(c * h * w);
     let mut lists = Vec::with_capacity(c);
 
     for index in 0..c {
         let camera = inputs.camera::<T>(index, args);
-        let camera_lists = TileLists::new(camera.packed, camera.opacities, args);
+        let camera_lists = match TileLists::new(camera.packed, camera.opacities, args) {
+            Ok(lists) => lists,
+            Err(error) => {
+                args.errors.report(error);
+                let black = vec![T::ZERO; image.len()];
+                return (tensor(black, [c, h, w, d + 1]), State::none::<T>());
+            }
+        };
         let pixels = index * h * w..(index + 1) * h * w;
         let image = &mut image[pixels.start * (d + 1)..pixels.end * (d + 1)];
         image
@@ -264,7 +282,7 @@ pub(super) fn forward<T: Real>(
 
 vectorized! {
     /// Renders one row of tiles into its part of the image.
-    fn blend_row_of_tiles<T: Real>(
+    fn blend_row_of_tiles<T: Real, const FMA: bool>(
         camera: &Camera<T>,
         lists: &TileLists,
         ty: usize,
@@ -274,7 +292,7 @@ vectorized! {
     ) {
         for tx in 0..camera.grid.columns {
             let (_, splats) = lists.tile(ty * camera.grid.columns + tx);
-            let tile = ForwardTile::blend(camera, splats, tx, ty);
+            let tile = ForwardTile::blend::<FMA>(camera, splats, tx, ty);
             tile.store(camera, tx, ty, image, transmittance, last);
         }
     }
@@ -290,7 +308,7 @@ struct ForwardTile<T> {
 
 impl<T: Real> ForwardTile<T> {
     #[inline(always)]
-    fn blend(camera: &Camera<T>, splats: &[u32], tx: usize, ty: usize) -> Self {
+    fn blend<const FMA: bool>(camera: &Camera<T>, splats: &[u32], tx: usize, ty: usize) -> Self {
         let d = camera.channels;
         let thresholds = Thresholds::<T>::new(camera.args);
         let (columns, rows) = camera.inside(tx, ty);
@@ -322,7 +340,8 @@ impl<T: Real> ForwardTile<T> {
                 let transmittance = &mut tile.transmittance[row];
                 let (last, open) = (&mut tile.last[row], &mut open[row]);
                 for i in 0..TILE {
-                    let (_, _, falloff) = splat.falloff(centres[i] - splat.footprint.mean[0], dy);
+                    let (_, _, falloff) =
+                        splat.falloff::<FMA>(centres[i] - splat.footprint.mean[0], dy);
                     let raw = splat.opacity * falloff;
                     let alpha = thresholds.alpha(raw);
                     let before = transmittance[i];
@@ -472,7 +491,7 @@ pub(super) fn backward<T: Real>(
 
 vectorized! {
     /// Writes the partial gradients of one row of tiles; returns its share of the background's.
-    fn row_of_tiles_backward<T: Real>(
+    fn row_of_tiles_backward<T: Real, const FMA: bool>(
         camera: &Camera<T>,
         lists: &TileLists,
         upstream: &Upstream<T>,
@@ -488,7 +507,7 @@ vectorized! {
                 core::mem::take(&mut partials).split_at_mut(splats.len() * width);
             partials = rest;
             BackwardTile::load(camera, upstream, tx, ty, &mut background)
-                .blend(camera, splats, tx, ty, tile);
+                .blend::<FMA>(camera, splats, tx, ty, tile);
         }
         background
     }
@@ -603,7 +622,7 @@ impl<T: Real> BackwardTile<T> {
     /// d mean = -(w11 dz1 + w21 dz2, w22 dz2)
     /// ```
     #[inline(always)]
-    fn blend(
+    fn blend<const FMA: bool>(
         mut self,
         camera: &Camera<T>,
         splats: &[u32],
@@ -651,7 +670,7 @@ impl<T: Real> BackwardTile<T> {
                 let last = &self.last[row];
                 for i in 0..TILE {
                     let dx = centres[i] - splat.footprint.mean[0];
-                    let (z1, z2, falloff) = splat.falloff(dx, dy);
+                    let (z1, z2, falloff) = splat.falloff::<FMA>(dx, dy);
                     let raw = splat.opacity * falloff;
                     let alpha = thresholds.alpha(raw);
                     let blended = thresholds.seen(raw) & (last[i] > place as u32);

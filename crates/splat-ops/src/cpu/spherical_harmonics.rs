@@ -8,7 +8,7 @@ use core::marker::PhantomData;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
-use super::buffer::{Buffer, tensor};
+use super::buffer::{Buffer, overwritten, tensor};
 use super::math::{Vec3, dot, scale};
 use super::real::Real;
 use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
@@ -208,7 +208,7 @@ pub(super) fn backward<T: Real>(
 
     // d = v / |v|: the gradient of v is what is tangential, divided by |v|.
     let grad_dirs = wanted[1].then(|| {
-        let mut values = vec![T::ZERO; c * n * 3];
+        let mut values = overwritten::<T>(c * n * 3);
         values
             .par_chunks_mut(3)
             .with_min_len(CHUNK)

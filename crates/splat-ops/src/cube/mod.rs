@@ -7,7 +7,7 @@ mod project;
 mod rasterize;
 mod spherical_harmonics;
 #[cfg(all(test, feature = "cpu", feature = "wgpu"))]
-mod tests;
+pub(crate) mod tests;
 
 use burn::backend::TensorMetadata;
 use burn::tensor::{DType, Shape};
@@ -49,7 +49,8 @@ fn tensor(like: &CubeTensor, buffer: Buffer, shape: Shape) -> CubeTensor {
 }
 
 impl SplatBackend for CubeBackend {
-    type RasterizeState = splat_kernels::rasterize::RasterizeState;
+    /// `None`: nothing was rendered, see [`RasterizeArgs::errors`].
+    type RasterizeState = Option<splat_kernels::rasterize::RasterizeState>;
 
     fn project_forward(
         means: CubeTensor,
@@ -98,9 +99,6 @@ impl SplatBackend for CubeBackend {
         spherical_harmonics::backward(coeffs, dirs, grad, degree, wanted)
     }
 
-    /// # Panics
-    /// Where the device fails, or more pairs of a splat and a tile would have to be listed than can be indexed
-    /// (`splat_kernels::intersect::MAX_INSTANCES`).
     fn rasterize_forward(
         packed: CubeTensor,
         colors: CubeTensor,
@@ -108,10 +106,7 @@ impl SplatBackend for CubeBackend {
         background: Option<CubeTensor>,
         args: &RasterizeArgs,
     ) -> (CubeTensor, Self::RasterizeState) {
-        match rasterize::forward(packed, colors, opacities, background, args) {
-            Ok(rendered) => rendered,
-            Err(error) => panic!("rasterize: {error}"),
-        }
+        rasterize::forward(packed, colors, opacities, background, args)
     }
 
     fn rasterize_backward(
@@ -130,7 +125,7 @@ impl SplatBackend for CubeBackend {
             colors,
             opacities,
             background,
-            &state,
+            state.as_ref(),
             grad_output,
             args,
             wanted,

@@ -1,15 +1,18 @@
 //! Rasterisation on CubeCL devices.
 
 use burn::backend::TensorMetadata;
-use burn::tensor::Shape;
+use burn::backend::ops::FloatTensorOps;
+use burn::tensor::{FloatDType, Shape};
+use burn_cubecl::CubeBackend;
 use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::Buffer;
-use splat_kernels::intersect::{Frames, IntersectError};
+use splat_kernels::intersect::{Frames, IntersectError, MAX_INSTANCES};
 use splat_kernels::rasterize::{
     RasterizeInputs, RasterizeSettings, RasterizeState, rasterize, rasterize_vjp,
 };
 
 use super::{buffer, prepare, tensor};
+use crate::OpError;
 use crate::settings::RasterizeArgs;
 
 fn settings(args: &RasterizeArgs) -> RasterizeSettings {
@@ -65,25 +68,47 @@ impl Prepared {
     }
 }
 
-/// The image with alpha `[C, H, W, D + 1]`, and what the backward pass needs.
+fn op_error(error: IntersectError) -> OpError {
+    let op = "rasterize";
+    match error {
+        IntersectError::TooManyInstances(pairs) => OpError::TooManyPairs {
+            op,
+            pairs,
+            limit: MAX_INSTANCES,
+        },
+        IntersectError::Device(what) => OpError::Device { op, what },
+    }
+}
+
+fn zeros(like: &CubeTensor, shape: Shape) -> CubeTensor {
+    CubeBackend::float_zeros(shape, &like.device, FloatDType::F32)
+}
+
+/// The image with alpha `[C, H, W, D + 1]`, and what the backward pass needs. Where rendering fails, zeros and nothing,
+/// and the reason is in `args.errors`.
 pub(super) fn forward(
     packed: CubeTensor,
     colors: CubeTensor,
     opacities: CubeTensor,
     background: Option<CubeTensor>,
     args: &RasterizeArgs,
-) -> Result<(CubeTensor, RasterizeState), IntersectError> {
+) -> (CubeTensor, Option<RasterizeState>) {
     let prepared = Prepared::new(packed, colors, opacities, background);
     let inputs = prepared.inputs();
     let frames = frames(&prepared.colors, args);
-    let (output, state) = rasterize(&prepared.packed.client, &inputs, &frames, &settings(args))?;
     let shape = Shape::from([
         frames.cameras,
         frames.height as usize,
         frames.width as usize,
         inputs.channels + 1,
     ]);
-    Ok((tensor(&prepared.packed, output, shape), state))
+    match rasterize(&prepared.packed.client, &inputs, &frames, &settings(args)) {
+        Ok((output, state)) => (tensor(&prepared.packed, output, shape), Some(state)),
+        Err(error) => {
+            args.errors.report(op_error(error));
+            (zeros(&prepared.packed, shape), None)
+        }
+    }
 }
 
 /// The wanted gradients of packed splats, colours, opacities and background.
@@ -92,12 +117,21 @@ pub(super) fn backward(
     colors: CubeTensor,
     opacities: CubeTensor,
     background: Option<CubeTensor>,
-    state: &RasterizeState,
+    state: Option<&RasterizeState>,
     grad_output: CubeTensor,
     args: &RasterizeArgs,
     wanted: [bool; 4],
 ) -> [Option<CubeTensor>; 4] {
     let prepared = Prepared::new(packed, colors, opacities, background);
+    let Some(state) = state else {
+        let [packed, colors, opacities] =
+            [&prepared.packed, &prepared.colors, &prepared.opacities].map(Some);
+        let inputs = [packed, colors, opacities, prepared.background.as_ref()];
+        return core::array::from_fn(|i| {
+            let input = inputs[i].filter(|_| wanted[i])?;
+            Some(zeros(input, input.shape()))
+        });
+    };
     let grad_output = prepare(grad_output);
     let [packed, colors, opacities, background] = rasterize_vjp(
         &grad_output.client,

@@ -5,12 +5,12 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
 use crate::{
-    ImageSize, ProjectSettings, RasterizeSettings, gaussian_blur, project, rasterize,
+    ImageSize, OpError, ProjectSettings, RasterizeSettings, gaussian_blur, project, rasterize,
     spherical_harmonics,
 };
 
 /// Whether there is a wgpu adapter, a software one included.
-fn has_adapter() -> bool {
+pub(crate) fn has_adapter() -> bool {
     use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
     let found = [DefaultDevice, Cpu]
         .into_iter()
@@ -174,6 +174,93 @@ fn kernels_agree_with_the_native_path_in_images_and_all_gradients() {
         // Both are f32: within the 1e-4 that each keeps to float64.
         assert!(error <= 1e-4, "{name}: relative L2 {error:e}");
     }
+}
+
+/// Distance in units in the last place, of positive floats.
+fn ulps(a: f32, b: f32) -> u32 {
+    a.to_bits().abs_diff(b.to_bits())
+}
+
+#[test]
+fn the_exponential_is_that_of_the_native_path() {
+    use crate::cpu::real::Real;
+    use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
+    let mut devices = [DefaultDevice, Cpu]
+        .into_iter()
+        .filter_map(|kind| cubecl::Device::wgpu(kind).ok());
+    let Some(device) = devices.next().filter(|_| has_adapter()) else {
+        return;
+    };
+    let client = device.client();
+    let sigmas: Vec<f32> = (0..=1_600_000).map(|i| i as f32 * 1e-5).collect();
+    let input = splat_kernels::Buffer::from_f32(&client, &sigmas);
+    let kernel = splat_kernels::exp::exp_neg_each(&client, &input)
+        .read_f32(&client)
+        .unwrap();
+    let compare = |native: fn(f32) -> f32| {
+        let pairs = sigmas.iter().zip(&kernel);
+        let distances = pairs.map(|(sigma, kernel)| ulps(native(*sigma), *kernel));
+        let (mut worst, mut different) = (0, 0);
+        for distance in distances {
+            worst = worst.max(distance);
+            different += u32::from(distance > 0);
+        }
+        (worst, different)
+    };
+    let fused = compare(f32::exp_neg::<true>);
+    let plain = compare(f32::exp_neg::<false>);
+    println!("(worst distance in ulp, values that differ): fused {fused:?}, plain {plain:?}");
+    // WGSL leaves it to the device whether its fma is one rounding or two, but not to mix them.
+    assert!(
+        fused.0 == 0 || plain.0 == 0,
+        "fused {fused:?}, plain {plain:?}"
+    );
+    assert!(fused.0.max(plain.0) <= 1);
+    let worst = sigmas
+        .iter()
+        .zip(&kernel)
+        .fold(0.0f64, |worst, (sigma, kernel)| {
+            worst.max((f64::from(*kernel) / (-f64::from(*sigma)).exp() - 1.0).abs())
+        });
+    assert!(worst < 2.5e-7, "relative error {worst:e}");
+}
+
+#[test]
+fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
+    if !has_adapter() {
+        return;
+    }
+    // 12,000 splats over each of 4096 x 4 tiles: more than the 195 million pairs that can be listed.
+    let n = 12_000;
+    let size = ImageSize {
+        width: 65_536,
+        height: 64,
+    };
+    let device = Device::wgpu(DeviceKind::DefaultDevice).autodiff();
+    let full = |values: &[f32]| {
+        let data = TensorData::new(values.repeat(n), [n, values.len()]);
+        Tensor::<2>::from_data(data, &device)
+    };
+    let projected = project(
+        full(&[0.0, 0.0, 1.0]),
+        full(&[1.0, 0.0, 0.0, 0.0]),
+        full(&[1.0, 1.0, 1.0]),
+        Tensor::<2>::eye(4, &device).unsqueeze::<3>(),
+        Tensor::<2>::from_data([[1e7, 1e7, 32_768.0, 32.0]], &device),
+        size,
+        &ProjectSettings::default(),
+    )
+    .unwrap();
+    let colors = full(&[1.0]).require_grad();
+    let opacities = full(&[0.5]).squeeze_dim::<1>(1);
+    let settings = RasterizeSettings::default();
+    let error = rasterize(&projected, colors, opacities, None, &settings).unwrap_err();
+    println!("{error}");
+    let pairs = n as u64 * 4096 * 4;
+    assert!(
+        matches!(error, OpError::TooManyPairs { pairs: found, .. } if found == pairs),
+        "{error:?}"
+    );
 }
 
 /// Prints times; run it by name with `--ignored --nocapture`.

@@ -1,0 +1,18 @@
+//! What must hold on every backend: the native path, and the kernels where there is an adapter.
+
+mod decisions;
+mod poison;
+
+use burn::tensor::Device;
+
+/// The devices of this machine, named.
+fn devices() -> Vec<(&'static str, Device)> {
+    #[allow(unused_mut)]
+    let mut devices = vec![("Flex", Device::flex())];
+    #[cfg(feature = "wgpu")]
+    if crate::cube::tests::has_adapter() {
+        let kind = burn::tensor::DeviceKind::DefaultDevice;
+        devices.push(("wgpu", Device::wgpu(kind)));
+    }
+    devices
+}
