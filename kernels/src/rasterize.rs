@@ -21,6 +21,7 @@ use cubecl::prelude::*;
 use crate::exp::exp_neg;
 use crate::intersect::{Frames, Grid, IntersectError, TILE, TileLists, intersect};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
+use crate::math::is_finite;
 use crate::project::PACKED;
 
 /// Channels of one launch.
@@ -342,6 +343,44 @@ fn rasterize_forward(
     }
 }
 
+/// The opacity of every splat, zero where a colour is not finite: it is then in no list, and nothing reads it.
+#[cube(launch)]
+fn hide_broken_colors(
+    colors: &[f32],
+    opacities: &[f32],
+    out: &mut [f32],
+    splats: u32,
+    channels: u32,
+) {
+    let splat = ABSOLUTE_POS;
+    if splat < splats as usize {
+        let mut opacity = opacities[splat];
+        for channel in 0..channels as usize {
+            if !is_finite(colors[splat * channels as usize + channel]) {
+                opacity = 0.0f32;
+            }
+        }
+        out[splat] = opacity;
+    }
+}
+
+fn without_broken_colors(client: &Client, inputs: &RasterizeInputs, frames: &Frames) -> Buffer {
+    let out = Buffer::empty(client, frames.splats());
+    if let Some((count, dim)) = per_element(frames.splats()) {
+        hide_broken_colors::launch(
+            client,
+            count,
+            dim,
+            inputs.colors.arg(),
+            inputs.opacities.arg(),
+            out.arg(),
+            frames.splats() as u32,
+            inputs.channels as u32,
+        );
+    }
+    out
+}
+
 /// Renders all cameras: the image with alpha as its last channel [C, H, W, D + 1], and what the backward pass needs.
 /// Waits for the device once, to learn the number of instances.
 ///
@@ -353,7 +392,8 @@ pub fn rasterize(
     frames: &Frames,
     settings: &RasterizeSettings,
 ) -> Result<(Buffer, RasterizeState), IntersectError> {
-    let lists = intersect(client, &inputs.packed, &inputs.opacities, frames)?;
+    let opacities = without_broken_colors(client, inputs, frames);
+    let lists = intersect(client, &inputs.packed, &opacities, frames)?;
     let pixels = frames.cameras * frames.width as usize * frames.height as usize;
     let output = Buffer::empty(client, pixels * (inputs.channels + 1));
     let transmittance = Buffer::empty(client, pixels);

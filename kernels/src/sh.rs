@@ -254,7 +254,12 @@ fn sh_backward_dirs(
             let mut weights = Array::<f32>::new(comptime!(functions(degree)));
             #[unroll]
             for k in 0..comptime!(functions(degree)) {
-                weights[k] = g.dot(Vec3::load(coefficients, first + k * 3));
+                let coefficient = Vec3::load(coefficients, first + k * 3);
+                // A channel without gradient (black, and clamped there) does not look at its coefficient, which may be
+                // infinite.
+                weights[k] = select(g.x == 0.0f32, 0.0f32, g.x * coefficient.x)
+                    + select(g.y == 0.0f32, 0.0f32, g.y * coefficient.y)
+                    + select(g.z == 0.0f32, 0.0f32, g.z * coefficient.z);
             }
             let h = basis_vjp(v, &weights, degree);
             h.sub(v.scale(v.dot(h)))

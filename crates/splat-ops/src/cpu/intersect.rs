@@ -189,19 +189,26 @@ impl Grid {
 }
 
 impl TileLists {
-    /// Lists for one camera: packed splats `[N, 9]` and opacities `[N]`.
+    /// Lists for one camera: packed splats `[N, 9]`, colours `[N, D]` and opacities `[N]`. A splat with
+    /// a colour that is not finite is in no list: it would be in every pixel it touches.
     pub(super) fn new<T: Real>(
         packed: &[T],
+        colors: &[T],
         opacities: &[T],
         args: &RasterizeArgs,
     ) -> Result<Self, OpError> {
+        let channels = colors.len() / opacities.len().max(1);
         let limit = max_pairs();
         let grid = Grid::new(args);
         let footprints: Vec<Option<Footprint<T>>> = packed
             .par_chunks_exact(PROJECTED_WIDTH)
+            .zip(colors.par_chunks_exact(channels.max(1)))
             .zip(opacities)
             .with_min_len(CHUNK)
-            .map(|(row, opacity)| Footprint::new(row, *opacity, args))
+            .map(|((row, color), opacity)| {
+                let footprint = Footprint::new(row, *opacity, args)?;
+                color.iter().all(|c| c.is_finite()).then_some(footprint)
+            })
             .collect();
         // The exact count costs as much as the lists do: only where the bounding boxes are too many.
         let sum = |count: fn(&Footprint<T>, Grid) -> u64| -> u64 {

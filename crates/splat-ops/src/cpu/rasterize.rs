@@ -252,14 +252,15 @@ pub(super) fn forward<T: Real>(
 
     for index in 0..c {
         let camera = inputs.camera::<T>(index, args);
-        let camera_lists = match TileLists::new(camera.packed, camera.opacities, args) {
-            Ok(lists) => lists,
-            Err(error) => {
-                args.errors.report(error);
-                let black = vec![T::ZERO; image.len()];
-                return (tensor(black, [c, h, w, d + 1]), State::none::<T>());
-            }
-        };
+        let camera_lists =
+            match TileLists::new(camera.packed, camera.colors, camera.opacities, args) {
+                Ok(lists) => lists,
+                Err(error) => {
+                    args.errors.report(error);
+                    let black = vec![T::ZERO; image.len()];
+                    return (tensor(black, [c, h, w, d + 1]), State::none::<T>());
+                }
+            };
         let pixels = index * h * w..(index + 1) * h * w;
         let image = &mut image[pixels.start * (d + 1)..pixels.end * (d + 1)];
         image

@@ -166,6 +166,21 @@ fn is_zero<T: Real>(grad: &[T]) -> bool {
     grad.iter().all(|g| *g == T::ZERO)
 }
 
+/// `grad . coeff`, where a channel without gradient (black, and clamped there) does not look at its coefficient, which
+/// may be infinite.
+#[inline(always)]
+fn guarded_dot<T: Real>(grad: Vec3<T>, coeff: &[T]) -> T {
+    let mut sum = T::ZERO;
+    for (grad, coeff) in grad.into_iter().zip(coeff) {
+        sum += if grad == T::ZERO {
+            T::ZERO
+        } else {
+            grad * *coeff
+        };
+    }
+    sum
+}
+
 pub(super) fn backward<T: Real>(
     _: PhantomData<T>,
     coeffs: FlexTensor,
@@ -223,7 +238,7 @@ pub(super) fn backward<T: Real>(
                 let mut sum = [T::ZERO; 3];
                 for (coeff, derivative) in coeffs.chunks_exact(3).zip(basis_gradient(degree, unit))
                 {
-                    let weight = dot(grad, [coeff[0], coeff[1], coeff[2]]);
+                    let weight = guarded_dot(grad, coeff);
                     for (sum, derivative) in sum.iter_mut().zip(derivative) {
                         *sum += weight * derivative;
                     }
