@@ -15,7 +15,7 @@ use crate::settings::RasterizeArgs;
 pub(super) const TILE: usize = 16;
 
 /// Splats per unit of parallel work.
-const CHUNK: usize = 256;
+pub(super) const CHUNK: usize = 256;
 
 /// Pairs of a tile and a splat of one camera that can be listed: they are counted in 32 bits.
 const MAX_PAIRS: u64 = u32::MAX as u64;
@@ -49,8 +49,8 @@ pub(super) struct TileLists {
     pub(super) spans: Vec<u32>,
     /// Where each emitted instance went when they were sorted by tile.
     pub(super) position: Vec<u32>,
-    /// The splat of each instance sorted by tile, front to back in each tile.
-    pub(super) splats: Vec<u32>,
+    /// The place in `order` of the splat of each instance, sorted by tile, front to back in each tile.
+    pub(super) ranks: Vec<u32>,
     /// `tiles[t]..tiles[t + 1]`: the sorted instances of tile t, tiles in rows.
     pub(super) tiles: Vec<u32>,
 }
@@ -267,15 +267,14 @@ impl TileLists {
         let total = tiles[tiles.len() - 1] as usize;
         let mut next = tiles.clone();
         let mut position = Vec::with_capacity(total);
-        let mut splats = overwritten::<u32>(total);
-        let mut owners = order
-            .iter()
+        let mut ranks = overwritten::<u32>(total);
+        let mut owners = (0u32..)
             .zip(spans.windows(2))
-            .flat_map(|(n, span)| core::iter::repeat_n(*n, (span[1] - span[0]) as usize));
+            .flat_map(|(rank, span)| core::iter::repeat_n(rank, (span[1] - span[0]) as usize));
         for tile in emitted.iter().flat_map(|(tiles, _)| tiles) {
             let slot = &mut next[*tile as usize];
-            if let Some(n) = owners.next() {
-                splats[*slot as usize] = n;
+            if let Some(rank) = owners.next() {
+                ranks[*slot as usize] = rank;
             }
             position.push(*slot);
             *slot += 1;
@@ -284,20 +283,20 @@ impl TileLists {
             order,
             spans,
             position,
-            splats,
+            ranks,
             tiles,
         })
     }
 
     /// Number of (splat, tile) pairs.
     pub(super) fn instances(&self) -> usize {
-        self.splats.len()
+        self.ranks.len()
     }
 
-    /// The splats of a tile, front to back, and where they begin among the sorted instances.
+    /// The places in `order` of a tile's splats, front to back, and where they begin among the sorted instances.
     pub(super) fn tile(&self, tile: usize) -> (usize, &[u32]) {
         let (start, end) = (self.tiles[tile] as usize, self.tiles[tile + 1] as usize);
-        (start, &self.splats[start..end])
+        (start, &self.ranks[start..end])
     }
 }
 

@@ -39,6 +39,8 @@ pub(crate) trait Real:
     fn ln(self) -> Self;
     fn abs(self) -> Self;
     fn is_finite(self) -> bool;
+    /// `a b + c`, in one rounding where `FMA` says that this is one instruction.
+    fn multiply_add<const FMA: bool>(a: Self, b: Self, c: Self) -> Self;
     /// `exp(-sigma)` for `sigma >= 0`; anything under 1e-30 may come out as any such value. `FMA`: with
     /// fused products and sums, for code that is compiled for a processor which has them.
     fn exp_neg<const FMA: bool>(sigma: Self) -> Self;
@@ -81,6 +83,10 @@ impl Real for f64 {
         self.is_finite()
     }
     #[inline(always)]
+    fn multiply_add<const FMA: bool>(a: Self, b: Self, c: Self) -> Self {
+        if FMA { a.mul_add(b, c) } else { a * b + c }
+    }
+    #[inline(always)]
     fn exp_neg<const FMA: bool>(sigma: Self) -> Self {
         (-sigma).exp()
     }
@@ -112,6 +118,10 @@ impl Real for f32 {
         self.is_finite()
     }
     #[inline(always)]
+    fn multiply_add<const FMA: bool>(a: Self, b: Self, c: Self) -> Self {
+        if FMA { a.mul_add(b, c) } else { a * b + c }
+    }
+    #[inline(always)]
     fn exp_neg<const FMA: bool>(sigma: Self) -> Self {
         exp_neg_f32::<FMA>(sigma)
     }
@@ -138,9 +148,7 @@ fn exp_neg_f32<const FMA: bool>(sigma: f32) -> f32 {
     // ln(2) in two parts; the first has so few bits that n * LN2_HIGH is exact.
     const LN2_HIGH: f32 = 0.693_359_4;
     const LN2_LOW: f32 = -2.121_944_4e-4;
-    let multiply_add = |a: f32, b: f32, c: f32| {
-        if FMA { a.mul_add(b, c) } else { a * b + c }
-    };
+    let multiply_add = f32::multiply_add::<FMA>;
 
     let x = -(sigma.least(80.0));
     let shifted = multiply_add(x, core::f32::consts::LOG2_E, ROUND);
