@@ -1,7 +1,7 @@
 //! Image losses and metrics, as functions on tensors of images `[B, H, W, D]`.
 
 use burn::tensor::Tensor;
-use splat_ops::{OpError, gaussian_blur};
+use splat_ops::{OpError, SsimArgs, ssim_map};
 
 /// Mean absolute difference, `[1]`.
 pub fn l1(image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
@@ -64,32 +64,23 @@ pub fn ssim(
     target: Tensor<4>,
     settings: &SsimSettings,
 ) -> Result<Tensor<1>, OpError> {
-    let [_, height, width, _] = image.dims();
-    let weights = settings.weights();
-    let radius = settings.window / 2;
-    let window = |x: Tensor<4>| -> Result<Tensor<4>, OpError> {
-        let blurred = gaussian_blur(x, &weights)?;
-        Ok(if height >= settings.window && width >= settings.window {
-            blurred
-                .narrow(1, radius, height - 2 * radius)
-                .narrow(2, radius, width - 2 * radius)
-        } else {
-            blurred
-        })
+    let args = SsimArgs {
+        window: settings.weights(),
+        c1: settings.k1.powi(2),
+        c2: settings.k2.powi(2),
     };
-    let (c1, c2) = (settings.k1.powi(2), settings.k2.powi(2));
+    Ok(inside(ssim_map(image, target, &args)?, settings.window).mean())
+}
 
-    let mean_x = window(image.clone())?;
-    let mean_y = window(target.clone())?;
-    let mean_xy = mean_x.clone() * mean_y.clone();
-    let mean_xx_yy = mean_x.square() + mean_y.square();
-    // Of x^2 + y^2 only the sum of the two variances is needed: one window instead of two.
-    let variances = window(image.clone().square() + target.clone().square())? - mean_xx_yy.clone();
-    let covariance = window(image * target)? - mean_xy.clone();
-
-    let similarity = (mean_xy * 2.0 + c1) * (covariance * 2.0 + c2);
-    let scale = (mean_xx_yy + c1) * (variances + c2);
-    Ok((similarity / scale).mean())
+/// The pixels whose window lies inside the image; all of them where there is none.
+fn inside(map: Tensor<4>, window: usize) -> Tensor<4> {
+    let [_, height, width, _] = map.dims();
+    if height < window || width < window {
+        return map;
+    }
+    let radius = window / 2;
+    map.narrow(1, radius, height - 2 * radius)
+        .narrow(2, radius, width - 2 * radius)
 }
 
 #[cfg(all(test, feature = "cpu"))]

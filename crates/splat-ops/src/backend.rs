@@ -13,6 +13,7 @@ use burn::backend::{Autodiff, Dispatch};
 
 use crate::adam::AdamStep;
 use crate::settings::{ProjectArgs, RasterizeArgs};
+use crate::ssim::SsimArgs;
 
 /// Floats per splat in the packed output of `project`:
 /// `[mean_x, mean_y, depth, w11, w21, w22, compensation, extent_x, extent_y]`.
@@ -97,6 +98,65 @@ pub trait SplatBackend: Backend {
     /// outside. Linear and self-adjoint: its own vector-Jacobian product.
     fn gaussian_blur(image: FloatTensor<Self>, window: &[f64]) -> FloatTensor<Self>;
 
+    /// [`ssim_map`](crate::ssim_map) of two images, and what the backend keeps for the gradient. Composed of tensor ops
+    /// unless a backend knows better: the windowed means of x, y, x^2 + y^2 and xy.
+    fn ssim_forward(
+        images: [FloatTensor<Self>; 2],
+        args: &SsimArgs,
+    ) -> (FloatTensor<Self>, Vec<FloatTensor<Self>>) {
+        let [x, y] = images;
+        let square = |v: &FloatTensor<Self>| Self::float_mul(v.clone(), v.clone());
+        let squares = Self::float_add(square(&x), square(&y));
+        let product = Self::float_mul(x.clone(), y.clone());
+        let moments: Vec<_> = [x, y, squares, product]
+            .into_iter()
+            .map(|image| <Self as SplatBackend>::gaussian_blur(image, &args.window))
+            .collect();
+        let [a, b, c, d] = ssim_terms::<Self>(&moments, args);
+        (
+            Self::float_div(Self::float_mul(a, c), Self::float_mul(b, d)),
+            moments,
+        )
+    }
+
+    /// Gradients of both images, given that of the map; see the formulas in `cpu/ssim.rs`.
+    fn ssim_backward(
+        images: [FloatTensor<Self>; 2],
+        moments: Vec<FloatTensor<Self>>,
+        grad: FloatTensor<Self>,
+        args: &SsimArgs,
+        wanted: [bool; 2],
+    ) -> [Option<FloatTensor<Self>>; 2] {
+        let [x, y] = images;
+        let [a, b, c, d] = ssim_terms::<Self>(&moments, args);
+        let mul =
+            |l: &FloatTensor<Self>, r: &FloatTensor<Self>| Self::float_mul(l.clone(), r.clone());
+        let div =
+            |l: &FloatTensor<Self>, r: &FloatTensor<Self>| Self::float_div(l.clone(), r.clone());
+        let twice = |v: FloatTensor<Self>| Self::float_mul_scalar(v, 2.0.into());
+        let blur = |v: FloatTensor<Self>| <Self as SplatBackend>::gaussian_blur(v, &args.window);
+
+        let scaled = div(&grad, &mul(&b, &d));
+        let weighted = mul(&scaled, &mul(&a, &c));
+        let slope = Self::float_sub(div(&weighted, &d), div(&weighted, &b));
+        let contrast = mul(&scaled, &Self::float_sub(c, a.clone()));
+        let by_squares = twice(blur(Self::float_neg(div(&weighted, &d))));
+        let by_product = blur(twice(mul(&scaled, &a)));
+        let gradient = |own: &FloatTensor<Self>, other: &FloatTensor<Self>, mine: usize| {
+            let theirs = 1 - mine;
+            let by_mean = blur(twice(Self::float_add(
+                mul(&moments[theirs], &contrast),
+                mul(&moments[mine], &slope),
+            )));
+            let rest = Self::float_add(mul(own, &by_squares), mul(other, &by_product));
+            Self::float_add(by_mean, rest)
+        };
+        [
+            wanted[0].then(|| gradient(&x, &y, 0)),
+            wanted[1].then(|| gradient(&y, &x, 1)),
+        ]
+    }
+
     /// Parameter, gradient and both moments to parameter and moments after
     /// [`adam_step`](crate::adam_step). Composed of tensor ops unless a backend knows better.
     fn adam(tensors: [FloatTensor<Self>; 4], step: &AdamStep) -> [FloatTensor<Self>; 3] {
@@ -121,6 +181,23 @@ pub trait SplatBackend: Backend {
         let delta = Self::float_mul_scalar(delta, step.rate.into());
         [Self::float_sub(param, delta), moment_1, moment_2]
     }
+}
+
+/// A, B, C, D of the structural similarity `A C / (B D)`, from the four windowed means.
+fn ssim_terms<B: Backend>(moments: &[FloatTensor<B>], args: &SsimArgs) -> [FloatTensor<B>; 4] {
+    let [mx, my, q, p] = [0, 1, 2, 3].map(|i| moments[i].clone());
+    let product = B::float_mul(mx.clone(), my.clone());
+    let squares = B::float_add(B::float_mul(mx.clone(), mx), B::float_mul(my.clone(), my));
+    let twice_and = |v, constant: f64| {
+        let twice = B::float_mul_scalar(v, 2.0.into());
+        B::float_add_scalar(twice, constant.into())
+    };
+    [
+        twice_and(product.clone(), args.c1),
+        B::float_add_scalar(squares.clone(), args.c1.into()),
+        twice_and(B::float_sub(p, product), args.c2),
+        B::float_add_scalar(B::float_sub(q, squares), args.c2.into()),
+    ]
 }
 
 /// A parameter and its moments, in the form in which Burn's dispatch can carry them.
@@ -167,6 +244,8 @@ pub(crate) trait SplatOps: Backend {
     ) -> FloatTensor<Self>;
 
     fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self>;
+
+    fn ssim(x: FloatTensor<Self>, y: FloatTensor<Self>, args: SsimArgs) -> FloatTensor<Self>;
 
     fn adam(
         param: FloatTensor<Self>,
@@ -216,6 +295,14 @@ macro_rules! forward_only {
 
             fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self> {
                 <Self as SplatBackend>::gaussian_blur(image, &window)
+            }
+
+            fn ssim(
+                x: FloatTensor<Self>,
+                y: FloatTensor<Self>,
+                args: SsimArgs,
+            ) -> FloatTensor<Self> {
+                Self::ssim_forward([x, y], &args).0
             }
 
             fn adam(

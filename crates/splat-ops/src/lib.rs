@@ -34,6 +34,7 @@ mod error;
 mod project;
 mod rasterize;
 mod spherical_harmonics;
+mod ssim;
 #[cfg(all(test, feature = "cpu"))]
 mod tests;
 
@@ -44,3 +45,4 @@ pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};
 pub use settings::{ImageSize, ProjectSettings, RasterizeSettings};
 pub use spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count, spherical_harmonics};
+pub use ssim::{SsimArgs, ssim_map};

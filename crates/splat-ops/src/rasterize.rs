@@ -12,6 +12,9 @@ use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
 #[derive(Debug, Clone)]
 pub struct Rendered {
     packed: Tensor<4>,
+    /// Views of it, cut once: the gradient of every cut is a whole picture of its own.
+    image: Tensor<4>,
+    alpha: Tensor<4>,
 }
 
 impl Rendered {
@@ -22,14 +25,12 @@ impl Rendered {
 
     /// `[C, H, W, D]`: blended channels, in front of the background where one was given.
     pub fn image(&self) -> Tensor<4> {
-        let channels = self.packed.dims()[3] - 1;
-        self.packed.clone().narrow(3, 0, channels)
+        self.image.clone()
     }
 
     /// `[C, H, W, 1]`: accumulated opacity, one minus the final transmittance.
     pub fn alpha(&self) -> Tensor<4> {
-        let channels = self.packed.dims()[3] - 1;
-        self.packed.clone().narrow(3, channels, 1)
+        self.alpha.clone()
     }
 }
 
@@ -118,7 +119,10 @@ pub fn rasterize<const DC: usize, const DO: usize>(
     if let Some(error) = errors.error() {
         return Err(error.clone());
     }
+    let packed = Tensor::from_dispatch(packed);
     Ok(Rendered {
-        packed: Tensor::from_dispatch(packed),
+        image: packed.clone().narrow(3, 0, channels),
+        alpha: packed.clone().narrow(3, channels, 1),
+        packed,
     })
 }

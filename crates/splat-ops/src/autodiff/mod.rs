@@ -6,6 +6,7 @@ mod blur;
 mod project;
 mod rasterize;
 mod spherical_harmonics;
+mod ssim;
 
 use burn::backend::autodiff::NodeId;
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
@@ -15,6 +16,7 @@ use burn::backend::{Autodiff, AutodiffBackend, tensor::FloatTensor};
 use crate::adam::AdamStep;
 use crate::backend::{AdamTensors, Background, SplatBackend, SplatOps};
 use crate::settings::{ProjectArgs, RasterizeArgs};
+use crate::ssim::SsimArgs;
 
 impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
     fn project(
@@ -48,6 +50,10 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
 
     fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self> {
         blur::gaussian_blur::<B, C>(image, window)
+    }
+
+    fn ssim(x: FloatTensor<Self>, y: FloatTensor<Self>, args: SsimArgs) -> FloatTensor<Self> {
+        ssim::ssim::<B, C>([x, y], args)
     }
 
     /// An optimiser's step is no part of any graph: what comes out is new leaves.

@@ -5,68 +5,78 @@ use core::marker::PhantomData;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
-use super::buffer::{Buffer, tensor};
+use super::buffer::{Buffer, overwritten, tensor};
 use super::real::Real;
+use super::simd::vectorized;
+
+/// Values of a row that are summed at once.
+const LANES: usize = 16;
 
 pub(super) fn blur<T: Real>(_: PhantomData<T>, image: FlexTensor, window: &[f64]) -> FlexTensor {
     let image = Buffer::new(image);
     let [b, h, w, d] = image.dims();
     let image = image.slice::<T>();
     let window: Vec<T> = window.iter().map(|value| T::of(*value)).collect();
+    let radius = window.len() / 2;
     let row = w * d;
-    let mut rows_done = vec![T::ZERO; image.len()];
-    let mut all_done = vec![T::ZERO; image.len()];
+    let mut rows_done = overwritten::<T>(image.len());
+    let mut all_done = overwritten::<T>(image.len());
     if image.is_empty() {
         return tensor(all_done, [b, h, w, d]);
     }
 
-    // Along a row one pixel is d values further.
+    // Along a row one pixel is d values further; zeros before and after stand for the outside.
     rows_done
         .par_chunks_mut(row)
         .zip(image.par_chunks(row))
-        .for_each(|(out, input)| convolve(out, &window, |shift| shifted(input, shift, d)));
+        .for_each_init(
+            || vec![T::ZERO; row + 2 * radius * d],
+            |padded, (out, input)| {
+                padded[radius * d..][..row].copy_from_slice(input);
+                let sources: Vec<&[T]> =
+                    (0..window.len()).map(|k| &padded[k * d..][..row]).collect();
+                weighted_sum(out, &sources, &window);
+            },
+        );
     // Along a column one pixel is one row further.
     all_done
         .par_chunks_mut(row)
         .enumerate()
         .for_each(|(index, out)| {
             let (image, y) = (index / h, index % h);
-            convolve(out, &window, |shift| {
-                let source = y.checked_add_signed(shift).filter(|y| *y < h)?;
-                let start = (image * h + source) * row;
-                Some((0, &rows_done[start..start + row]))
-            });
+            let inside = |k: &usize| (radius..h + radius).contains(&(y + k));
+            let (weights, sources): (Vec<T>, Vec<&[T]>) = (0..window.len())
+                .filter(inside)
+                .map(|k| {
+                    let start = (image * h + y + k - radius) * row;
+                    (window[k], &rows_done[start..start + row])
+                })
+                .unzip();
+            weighted_sum(out, &sources, &weights);
         });
     tensor(all_done, [b, h, w, d])
 }
 
-/// `out += window[k] * input moved by k`, where `source` gives, for a shift, the part of the input
-/// that lands inside and where in `out` it begins.
-fn convolve<'a, T: Real>(
-    out: &mut [T],
-    window: &[T],
-    source: impl Fn(isize) -> Option<(usize, &'a [T])>,
-) {
-    let radius = (window.len() / 2) as isize;
-    for (k, weight) in window.iter().enumerate() {
-        let Some((start, input)) = source(k as isize - radius) else {
-            continue;
-        };
-        for (out, value) in out[start..].iter_mut().zip(input) {
-            *out += *weight * *value;
+vectorized! {
+    /// `out[i] = sum of weights[k] sources[k][i]`, all of one length.
+    pub(super) fn weighted_sum<T: Real, const FMA: bool>(out: &mut [T], sources: &[&[T]], weights: &[T]) {
+        let whole = out.len() - out.len() % LANES;
+        for start in (0..whole).step_by(LANES) {
+            let mut sums = [T::ZERO; LANES];
+            for (source, weight) in sources.iter().zip(weights) {
+                let source = &source[start..start + LANES];
+                for i in 0..LANES {
+                    sums[i] = T::multiply_add::<FMA>(*weight, source[i], sums[i]);
+                }
+            }
+            out[start..start + LANES].copy_from_slice(&sums);
+        }
+        for i in whole..out.len() {
+            let mut sum = T::ZERO;
+            for (source, weight) in sources.iter().zip(weights) {
+                sum = T::multiply_add::<FMA>(*weight, source[i], sum);
+            }
+            out[i] = sum;
         }
     }
-}
-
-/// A row read `shift` pixels further on: `out[i] = input[i + shift]` where that exists.
-fn shifted<T>(input: &[T], shift: isize, pixel: usize) -> Option<(usize, &[T])> {
-    let offset = shift.unsigned_abs() * pixel;
-    if offset >= input.len() {
-        return None;
-    }
-    Some(if shift < 0 {
-        (offset, &input[..input.len() - offset])
-    } else {
-        (0, &input[offset..])
-    })
 }

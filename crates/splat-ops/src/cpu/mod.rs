@@ -15,6 +15,7 @@ mod rasterize;
 pub(crate) mod real;
 mod simd;
 mod spherical_harmonics;
+mod ssim;
 
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
@@ -23,6 +24,7 @@ use burn::tensor::DType;
 use crate::adam::AdamStep;
 use crate::backend::SplatBackend;
 use crate::settings::{ProjectArgs, RasterizeArgs};
+use crate::ssim::SsimArgs;
 
 /// Runs a generic function in the precision of a tensor. The public ops let only F32 and F64 pass.
 macro_rules! in_precision {
@@ -140,6 +142,28 @@ impl SplatBackend for Flex {
 
     fn gaussian_blur(image: FlexTensor, window: &[f64]) -> FlexTensor {
         in_precision!(image, blur::blur, image, window)
+    }
+
+    fn ssim_forward(images: [FlexTensor; 2], args: &SsimArgs) -> (FlexTensor, Vec<FlexTensor>) {
+        in_precision!(images[0], ssim::forward, images, args)
+    }
+
+    fn ssim_backward(
+        images: [FlexTensor; 2],
+        moments: Vec<FlexTensor>,
+        grad: FlexTensor,
+        args: &SsimArgs,
+        wanted: [bool; 2],
+    ) -> [Option<FlexTensor>; 2] {
+        in_precision!(
+            images[0],
+            ssim::backward,
+            images,
+            moments,
+            grad,
+            args,
+            wanted
+        )
     }
 
     fn adam(tensors: [FlexTensor; 4], step: &AdamStep) -> [FlexTensor; 3] {

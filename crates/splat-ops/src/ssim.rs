@@ -1,0 +1,44 @@
+//! Structural similarity, pixel by pixel (Wang et al. 2004, eq. 13).
+
+use burn::backend::Dispatch;
+use burn::tensor::Tensor;
+
+use crate::OpError;
+use crate::backend::SplatOps;
+use crate::check::Checker;
+
+/// Window and constants of [`ssim_map`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct SsimArgs {
+    /// Weights along one axis, symmetric, of odd length.
+    pub window: Vec<f64>,
+    /// Constant of the luminance term.
+    pub c1: f64,
+    /// Constant of the contrast term.
+    pub c2: f64,
+}
+
+/// Structural similarity of two images `[B, H, W, D]` at every pixel and channel, `[B, H, W, D]`, zeros outside of
+/// the images:
+///
+/// ```text
+/// S = (2 mx my + c1) (2 (E[xy] - mx my) + c2) / ((mx^2 + my^2 + c1) (E[x^2 + y^2] - mx^2 - my^2 + c2))
+/// ```
+///
+/// where m and E are means under the window. Differentiable in both images.
+///
+/// # Errors
+/// When shapes, types or devices differ, or the window's length is even or it is not symmetric.
+pub fn ssim_map(x: Tensor<4>, y: Tensor<4>, args: &SsimArgs) -> Result<Tensor<4>, OpError> {
+    let check = Checker::new("ssim_map", "x", &x)?;
+    check.tensor("y", &y, x.dims().map(Some), "that of `x`")?;
+    let symmetric = args.window.iter().eq(args.window.iter().rev());
+    if args.window.len().is_multiple_of(2) || !symmetric {
+        return Err(check.argument(format!(
+            "the window must be symmetric and of odd length, got {:?}",
+            args.window
+        )));
+    }
+    let map = <Dispatch as SplatOps>::ssim(x.into_dispatch(), y.into_dispatch(), args.clone());
+    Ok(Tensor::from_dispatch(map))
+}
