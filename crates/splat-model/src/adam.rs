@@ -199,7 +199,9 @@ impl Optimizer for SplatAdam {
             epsilon: self.epsilon * correction_2,
         };
         let moments = [state.moment_1, state.moment_2];
-        let (tensor, [moment_1, moment_2]) = adam_step(tensor, grad, moments, &step);
+        let (tensor, [moment_1, moment_2]) = adam_step(tensor, grad, moments, &step).expect(
+            "a gradient has the shape of its parameter, and so have the moments made from it",
+        );
         state.moment_1 = moment_1;
         state.moment_2 = moment_2;
         (tensor, Some(state))

@@ -3,6 +3,7 @@
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 
+use crate::OpError;
 use crate::backend::SplatOps;
 
 /// The numbers of one step; the bias corrections are already in `rate` and `epsilon`.
@@ -24,17 +25,29 @@ pub struct AdamStep {
 ///
 /// A gradient whose square is not finite counts as zero: one NaN would stay in the moments for good.
 ///
-/// # Panics
+/// # Errors
 /// Where the shapes differ.
 pub fn adam_step<const D: usize>(
     param: Tensor<D>,
     grad: Tensor<D>,
     moments: [Tensor<D>; 2],
     step: &AdamStep,
-) -> (Tensor<D>, [Tensor<D>; 2]) {
+) -> Result<(Tensor<D>, [Tensor<D>; 2]), OpError> {
     let [moment_1, moment_2] = moments;
-    for other in [&grad, &moment_1, &moment_2] {
-        assert_eq!(param.dims(), other.dims(), "adam_step: shapes differ");
+    let others = [
+        ("grad", &grad),
+        ("moment_1", &moment_1),
+        ("moment_2", &moment_2),
+    ];
+    for (name, other) in others {
+        if param.dims() != other.dims() {
+            return Err(OpError::Shape {
+                op: "adam_step",
+                tensor: name,
+                expected: "that of `param`",
+                got: other.dims().to_vec(),
+            });
+        }
     }
     let stepped = <Dispatch as SplatOps>::adam(
         param.into_dispatch(),
@@ -43,8 +56,8 @@ pub fn adam_step<const D: usize>(
         moment_2.into_dispatch(),
         *step,
     );
-    (
+    Ok((
         Tensor::from_dispatch(stepped.param),
         [stepped.moment_1, stepped.moment_2].map(Tensor::from_dispatch),
-    )
+    ))
 }

@@ -7,8 +7,8 @@ use rand_pcg::Pcg32;
 
 use super::devices;
 use crate::{
-    AdamStep, ImageSize, ProjectSettings, RasterizeSettings, adam_step, gaussian_blur, project,
-    rasterize, spherical_harmonics,
+    AdamStep, ImageSize, ProjectSettings, RasterizeSettings, SsimArgs, adam_step, gaussian_blur,
+    project, rasterize, spherical_harmonics, ssim_map,
 };
 
 fn poison(on: bool) {
@@ -81,7 +81,13 @@ impl Scene {
         )
         .unwrap();
         let blurred = gaussian_blur(rendered.packed(), &[0.25, 0.5, 0.25]).unwrap();
-        let mut loss = blurred.clone().square().sum();
+        let args = SsimArgs {
+            window: vec![0.25, 0.5, 0.25],
+            c1: 1e-4,
+            c2: 9e-4,
+        };
+        let similarity = ssim_map(blurred.clone(), rendered.packed(), &args).unwrap();
+        let mut loss = blurred.clone().square().sum() + similarity.clone().square().sum();
         if n > 0 {
             loss = loss + harmonics.clone().square().sum();
         }
@@ -97,6 +103,7 @@ impl Scene {
             ("harmonics", bits(harmonics.into_data())),
             ("rendered", bits(rendered.packed().into_data())),
             ("blurred", bits(blurred.into_data())),
+            ("similarity", bits(similarity.into_data())),
         ];
         for (name, leaf) in [
             ("means", &means),
@@ -128,7 +135,7 @@ impl Scene {
         };
         let background = background.inner();
         let moments = [background.clone(), background.clone()];
-        let (stepped, moments) = adam_step(background.clone(), background, moments, &step);
+        let (stepped, moments) = adam_step(background.clone(), background, moments, &step).unwrap();
         found.push(("stepped", bits(stepped.into_data())));
         found.extend(moments.map(|moment| ("moment", bits(moment.into_data()))));
         found
@@ -160,7 +167,7 @@ fn reserved_memory_is_written_before_it_is_read() {
             poison(false);
             let case = format!("{name}: C = {cameras}, N = {gaussians}, D = {channels}");
             // With no splats some gradients are of nothing; otherwise all ten are there.
-            assert!(gaussians == 0 || clean.len() == 17, "{case}");
+            assert!(gaussians == 0 || clean.len() == 18, "{case}");
             for ((part, clean), (_, poisoned)) in clean.iter().zip(&poisoned) {
                 assert!(clean == poisoned, "{case}: {part} differs");
             }
