@@ -24,6 +24,8 @@ const PICTURE: (u32, u32) = (900, 560);
 pub struct Backend {
     /// Short: cpu, wgpu.
     pub name: String,
+    /// With the adapter's name.
+    pub description: String,
     /// The device.
     pub device: Device,
 }

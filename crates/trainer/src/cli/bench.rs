@@ -74,8 +74,10 @@ fn backends(global: &GlobalArgs) -> Result<Vec<Backend>, Failure> {
             device: choice,
             ..global.clone()
         })?;
+        let short = chosen.name.split(' ').next().unwrap_or_default();
         Ok(Backend {
-            name: chosen.name,
+            name: short.to_owned(),
+            description: chosen.name.clone(),
             device: chosen.device,
         })
     };
@@ -98,13 +100,16 @@ fn write(folder: &std::path::Path, name: &str, text: &str) -> Result<(), ReportE
 fn page(report: &Report, backends: &[Backend]) -> String {
     let names: Vec<&str> = backends
         .iter()
-        .map(|backend| backend.name.as_str())
+        .map(|backend| backend.description.as_str())
         .collect();
     format!(
         "# Accuracy\n\n\
          Written by `cargo run --release -- bench accuracy --report docs`.\n\n\
          Machine: {}. Backends: {}. Double precision on the CPU is the reference; it is itself held to PyTorch float64 \
          within a relative L2 error of 1e-9 on every fixture (`cargo test --release --test gradients`).\n\n\
+         There is one tier, exact: full single precision, `exp` by a polynomial of degree 5 (relative error 1.6e-7 fused, \
+         1.8e-7 not). A polynomial of degree 3 (1e-4) was measured and left out: forward and backward together gained 0 to \
+         2 % on 50,000 splats, and on 15,000 from 6 % less to 3 % more time.\n\n\
          ![error against time](accuracy.svg)\n\n{}",
         report.machine,
         names.join(", "),
