@@ -41,7 +41,9 @@ pub struct AdaptiveSettings {
     pub prune_opacity: f64,
     /// Above this share of the scene's scale a Gaussian is removed. Default 0.1.
     pub prune_scale: f64,
-    /// Milestone: large Gaussians are removed only after this step. Default 3,000.
+    /// Large Gaussians are removed only after this step, that of the first reset of opacities in 3DGS. Like the interval
+    /// of resets it does not shrink with the run: what is far away starts large and needs its time to split. Default
+    /// 3,000.
     pub prune_scale_start: usize,
     /// Opacity that a reset leaves. Default 0.01.
     pub reset_opacity: f64,
@@ -230,7 +232,7 @@ impl AdaptiveDensity {
         }
         (report.cloned, report.split) = (clones.len(), splits.len());
 
-        let prunes_large = step > self.run.milestone(settings.prune_scale_start);
+        let prunes_large = step > settings.prune_scale_start;
         let before = plan.source.len();
         let decisions: Vec<bool> = plan
             .source
