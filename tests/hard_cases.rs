@@ -1,6 +1,11 @@
 //! The 38 hard cases, each a named test, on the CPU and on the CubeCL kernels in single precision.
 #![cfg(feature = "cpu")]
 
+#[cfg(feature = "wgpu")]
+mod adapter;
+
+#[cfg(feature = "wgpu")]
+use adapter::adapter;
 use burn::tensor::Device;
 use splat_trainer::accuracy::{Case, cases};
 
@@ -31,30 +36,6 @@ fn check(number: u8, backend: &str, device: &Device) {
 fn every_number_is_there_once() {
     let numbers: Vec<u8> = cases().iter().map(|case| case.number).collect();
     assert_eq!(numbers, (1..=38).collect::<Vec<u8>>());
-}
-
-/// wgpu's adapter. Set `SPLAT_REQUIRE_WGPU=1` to make a missing one a failure instead of a skip.
-#[cfg(feature = "wgpu")]
-fn adapter() -> Option<Device> {
-    // A process can open it once.
-    static ADAPTER: std::sync::OnceLock<Option<Device>> = std::sync::OnceLock::new();
-    ADAPTER.get_or_init(open_adapter).clone()
-}
-
-#[cfg(feature = "wgpu")]
-fn open_adapter() -> Option<Device> {
-    match Device::wgpu_options().init() {
-        Ok(device) => Some(device),
-        Err(error) => {
-            let message = format!("no wgpu adapter, the CubeCL kernels are NOT checked: {error}");
-            assert!(
-                std::env::var_os("SPLAT_REQUIRE_WGPU").is_none(),
-                "SPLAT_REQUIRE_WGPU is set, but {message}"
-            );
-            eprintln!("\n*** SKIPPED: {message} ***\n");
-            None
-        }
-    }
 }
 
 macro_rules! hard_cases {

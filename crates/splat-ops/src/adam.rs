@@ -5,6 +5,7 @@ use burn::tensor::Tensor;
 
 use crate::OpError;
 use crate::backend::SplatOps;
+use crate::check::Checker;
 
 /// The numbers of one step; the bias corrections are already in `rate` and `epsilon`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -26,7 +27,7 @@ pub struct AdamStep {
 /// A gradient whose square is not finite counts as zero: one NaN would stay in the moments for good.
 ///
 /// # Errors
-/// Where the shapes differ.
+/// When shapes, types or devices differ.
 pub fn adam_step<const D: usize>(
     param: Tensor<D>,
     grad: Tensor<D>,
@@ -34,20 +35,13 @@ pub fn adam_step<const D: usize>(
     step: &AdamStep,
 ) -> Result<(Tensor<D>, [Tensor<D>; 2]), OpError> {
     let [moment_1, moment_2] = moments;
-    let others = [
+    let check = Checker::new("adam_step", "param", &param)?;
+    for (name, other) in [
         ("grad", &grad),
         ("moment_1", &moment_1),
         ("moment_2", &moment_2),
-    ];
-    for (name, other) in others {
-        if param.dims() != other.dims() {
-            return Err(OpError::Shape {
-                op: "adam_step",
-                tensor: name,
-                expected: "that of `param`",
-                got: other.dims().to_vec(),
-            });
-        }
+    ] {
+        check.tensor(name, other, param.dims().map(Some), "that of `param`")?;
     }
     let stepped = <Dispatch as SplatOps>::adam(
         param.into_dispatch(),

@@ -14,12 +14,7 @@ use crate::check::Checker;
 /// When the window's length is even or it is not symmetric.
 pub fn gaussian_blur(image: Tensor<4>, window: &[f64]) -> Result<Tensor<4>, OpError> {
     let check = Checker::new("gaussian_blur", "image", &image)?;
-    let symmetric = window.iter().eq(window.iter().rev());
-    if window.len().is_multiple_of(2) || !symmetric {
-        return Err(check.argument(format!(
-            "the window must be symmetric and of odd length, got {window:?}"
-        )));
-    }
+    check.window(window)?;
     let blurred = <Dispatch as SplatOps>::gaussian_blur(image.into_dispatch(), window.to_vec());
     Ok(Tensor::from_dispatch(blurred))
 }

@@ -74,6 +74,17 @@ impl Checker {
         Ok(())
     }
 
+    /// A window of a separable convolution.
+    pub(crate) fn window(&self, window: &[f64]) -> Result<(), OpError> {
+        let symmetric = window.iter().eq(window.iter().rev());
+        if window.len().is_multiple_of(2) || !symmetric {
+            return Err(self.argument(format!(
+                "the window must be symmetric and of odd length, got {window:?}"
+            )));
+        }
+        Ok(())
+    }
+
     pub(crate) fn argument(&self, what: String) -> OpError {
         OpError::Argument { op: self.op, what }
     }

@@ -32,13 +32,7 @@ pub struct SsimArgs {
 pub fn ssim_map(x: Tensor<4>, y: Tensor<4>, args: &SsimArgs) -> Result<Tensor<4>, OpError> {
     let check = Checker::new("ssim_map", "x", &x)?;
     check.tensor("y", &y, x.dims().map(Some), "that of `x`")?;
-    let symmetric = args.window.iter().eq(args.window.iter().rev());
-    if args.window.len().is_multiple_of(2) || !symmetric {
-        return Err(check.argument(format!(
-            "the window must be symmetric and of odd length, got {:?}",
-            args.window
-        )));
-    }
+    check.window(&args.window)?;
     let map = <Dispatch as SplatOps>::ssim(x.into_dispatch(), y.into_dispatch(), args.clone());
     Ok(Tensor::from_dispatch(map))
 }

@@ -9,10 +9,10 @@
 macro_rules! vectorized {
     (
         $(#[$meta:meta])*
-        $visibility:vis fn $name:ident<T: Real, const FMA: bool>($($argument:ident: $type:ty),* $(,)?) $(-> $result:ty)? $body:block
+        fn $name:ident<T: Real, const FMA: bool>($($argument:ident: $type:ty),* $(,)?) $(-> $result:ty)? $body:block
     ) => {
         $(#[$meta])*
-        $visibility fn $name<T: Real>($($argument: $type),*) $(-> $result)? {
+        fn $name<T: Real>($($argument: $type),*) $(-> $result)? {
             #[inline(always)]
             fn body<T: Real, const FMA: bool>($($argument: $type),*) $(-> $result)? $body
 

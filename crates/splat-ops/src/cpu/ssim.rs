@@ -14,7 +14,7 @@ use core::marker::PhantomData;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
-use super::blur::weighted_sum;
+use super::blur::Rows;
 use super::buffer::{Buffer, overwritten, tensor};
 use super::real::Real;
 use crate::ssim::SsimArgs;
@@ -23,79 +23,6 @@ use crate::ssim::SsimArgs;
 const MOMENTS: usize = 4;
 /// Fields whose blur makes a gradient.
 const FIELDS: usize = 3;
-
-/// Rows of images `[B, H, W, D]`, and the window over them.
-struct Rows<T> {
-    /// H.
-    height: usize,
-    /// W D.
-    length: usize,
-    /// D.
-    pixel: usize,
-    count: usize,
-    window: Vec<T>,
-}
-
-impl<T: Real> Rows<T> {
-    fn new([b, h, w, d]: [usize; 4], window: &[f64]) -> Self {
-        Self {
-            height: h,
-            length: w * d,
-            pixel: d,
-            count: b * h,
-            window: window.iter().map(|weight| T::of(*weight)).collect(),
-        }
-    }
-
-    fn range(&self, row: usize) -> core::ops::Range<usize> {
-        row * self.length..(row + 1) * self.length
-    }
-
-    /// Blurs N fields along the rows: `fill` writes the fields of a row, the result holds N blurred rows
-    /// per row.
-    fn along<const N: usize>(&self, fill: impl Fn(usize, [&mut [T]; N]) + Sync) -> Vec<T> {
-        let margin = self.window.len() / 2 * self.pixel;
-        let mut planes = overwritten::<T>(N * self.count * self.length);
-        planes
-            .par_chunks_mut(N * self.length)
-            .enumerate()
-            .for_each_init(
-                || core::array::from_fn::<_, N, _>(|_| vec![T::ZERO; self.length + 2 * margin]),
-                |padded, (row, out)| {
-                    fill(
-                        row,
-                        padded
-                            .each_mut()
-                            .map(|p| &mut p[margin..margin + self.length]),
-                    );
-                    for (out, padded) in out.chunks_exact_mut(self.length).zip(padded) {
-                        let sources: Vec<&[T]> = (0..self.window.len())
-                            .map(|k| &padded[k * self.pixel..][..self.length])
-                            .collect();
-                        weighted_sum(out, &sources, &self.window);
-                    }
-                },
-            );
-        planes
-    }
-
-    /// Blurs the planes of [`along`](Self::along) down the columns, one row, into `out` (N rows).
-    fn down<const N: usize>(&self, planes: &[T], row: usize, out: &mut [T]) {
-        let radius = self.window.len() / 2;
-        let (first, y) = (row - row % self.height, row % self.height);
-        let inside = |k: &usize| (radius..self.height + radius).contains(&(y + k));
-        for (n, out) in out.chunks_exact_mut(self.length).enumerate() {
-            let (weights, sources): (Vec<T>, Vec<&[T]>) = (0..self.window.len())
-                .filter(inside)
-                .map(|k| {
-                    let start = ((first + y + k - radius) * N + n) * self.length;
-                    (self.window[k], &planes[start..start + self.length])
-                })
-                .unzip();
-            weighted_sum(out, &sources, &weights);
-        }
-    }
-}
 
 /// The terms of S at one pixel.
 struct Terms<T> {
@@ -179,13 +106,8 @@ pub(super) fn backward<T: Real>(
 ) -> [Option<FlexTensor>; 2] {
     let images = images.map(Buffer::new);
     let shape: [usize; 4] = images[0].dims();
-    let (grad, moments) = (
-        Buffer::new(grad),
-        moments.into_iter().map(Buffer::new).next(),
-    );
-    let Some(moments) = moments else {
-        return [None, None];
-    };
+    // The forward keeps one tensor.
+    let (grad, moments) = (Buffer::new(grad), Buffer::new(moments[0].clone()));
     let [x, y] = images.each_ref().map(|image| image.slice::<T>());
     let gradient = |own: &[T], other: &[T], swapped: bool| {
         tensor(

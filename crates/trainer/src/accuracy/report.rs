@@ -37,6 +37,8 @@ pub struct Row {
     pub case: u8,
     /// Its name.
     pub name: &'static str,
+    /// What must hold, besides the relative L2 error of 1e-3.
+    pub demand: &'static str,
     /// Backend.
     pub backend: String,
     /// Relative L2 error of the image in single precision.
@@ -124,18 +126,19 @@ impl Report {
         )?;
         writeln!(
             text,
-            "| # | case | backend | image | gradient | worst group | ms | blended | holds | |"
+            "| # | case | demand | backend | image | gradient | worst group | ms | blended | holds | |"
         )?;
-        writeln!(text, "|--:|---|---|--:|--:|---|--:|--:|---|---|")?;
+        writeln!(text, "|--:|---|---|---|--:|--:|---|--:|--:|---|---|")?;
         for row in &self.cases {
             let time = row
                 .seconds
                 .map_or(String::new(), |s| format!("{:.1}", 1e3 * s));
             writeln!(
                 text,
-                "| {} | {} | {} | {:.1e} | {:.1e} | {} | {} | {} | {} | {} |",
+                "| {} | {} | {} | {} | {:.1e} | {:.1e} | {} | {} | {} | {} | {} |",
                 row.case,
                 row.name,
+                row.demand,
                 row.backend,
                 row.forward,
                 row.gradient,
@@ -338,6 +341,7 @@ fn measure(case: &Case, backend: &Backend) -> Result<Row, AccuracyError> {
     Ok(Row {
         case: case.number,
         name: case.name,
+        demand: case.demand,
         backend: backend.name.clone(),
         forward: outcome.forward,
         gradient: outcome.gradient,

@@ -254,13 +254,7 @@ fn judge_group(g: &Group, r: &Group, input_size: f64, scale: f64, gate: f64) -> 
 
 fn judge_output(name: &'static str, ours: &Array, reference: &Array, gate: f64) -> OutputReport {
     let differences: Vec<_> = pairs(&ours.values, &reference.values, |g, r| g - r).collect();
-    let length = norm(&reference.values);
-    let distance = norm(&differences);
-    let rel_l2 = if length > 0.0 {
-        distance / length
-    } else {
-        distance
-    };
+    let rel_l2 = relative_l2(&ours.values, &reference.values);
     OutputReport {
         name,
         max_abs: differences
@@ -281,6 +275,15 @@ fn one_minus_cosine(g: &[f64], r: &[f64]) -> f64 {
         return 1.0;
     }
     pairs(g, r, |g, r| (g / lg - r / lr).powi(2)).sum::<f64>() / 2.0
+}
+
+/// |ours - reference| / |reference|; |ours| where the reference is all zero.
+pub(crate) fn relative_l2(ours: &[f64], reference: &[f64]) -> f64 {
+    let differences: Vec<_> = pairs(ours, reference, |g, r| g - r).collect();
+    match norm(reference) {
+        0.0 => norm(&differences),
+        length => norm(&differences) / length,
+    }
 }
 
 fn pairs<'a>(

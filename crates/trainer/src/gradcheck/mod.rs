@@ -20,6 +20,8 @@ use burn::tensor::{DType, Device};
 use splat_ops::OpError;
 
 pub use fixture::Fixture;
+#[cfg(feature = "cpu")]
+pub(crate) use judge::relative_l2;
 pub use judge::{FileReport, GroupReport, OutputReport, compare, gate};
 pub use report::{json, table};
 pub use run::{Bug, Computed, run};

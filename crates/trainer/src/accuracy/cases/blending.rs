@@ -5,10 +5,10 @@ use splat_ops::{ProjectSettings, RasterizeSettings, project, rasterize};
 
 use super::super::case::{Case, Check};
 use super::super::measure::{
-    AccuracyError, Outcome, against_double, clear, gradients, relative, single,
+    AccuracyError, Outcome, against_double, clear, clear_but, gradients, single,
 };
 use super::super::sketch::{Sketch, about_z, neighbours};
-use crate::gradcheck::Scene;
+use crate::gradcheck::{Scene, relative_l2};
 
 pub(super) const CASES: [Case; 14] = [
     Case::scenes(
@@ -171,14 +171,9 @@ fn exactly_at_cut() -> Vec<Scene> {
 
 /// These opacities at pixel centres; only those pixels are near a threshold.
 fn clear_elsewhere(opacities: &[f64], name: &'static str) -> Scene {
-    use super::super::measure::double;
-    use crate::gradcheck::walk;
-    let good = |scene: &Scene| {
-        double(scene)
-            .is_ok_and(|computed| walk(scene, &computed, 1e-5).near_threshold <= opacities.len())
-    };
-    let make = |seed| on_pixel_centres(name, seed, opacities);
-    (0..200).map(make).find(good).unwrap_or_else(|| make(200))
+    clear_but(opacities.len(), 1e-5, |seed| {
+        on_pixel_centres(name, seed, opacities)
+    })
 }
 
 fn covering() -> Vec<Scene> {
@@ -328,7 +323,7 @@ fn all_losses(device: &Device) -> Result<Outcome, AccuracyError> {
     let errors: Vec<f64> = ours
         .iter()
         .zip(&reference)
-        .map(|(a, b)| relative(a, b))
+        .map(|(a, b)| relative_l2(a, b))
         .collect();
     let worst = errors.iter().copied().fold(0.0, f64::max);
     Ok(outcome

@@ -5,11 +5,9 @@ use std::sync::Arc;
 use burn::tensor::Device;
 
 use super::super::case::Case;
-use super::super::measure::{
-    AccuracyError, Outcome, against_double, clear, double, relative, single,
-};
+use super::super::measure::{AccuracyError, Outcome, against_double, clear, double, single};
 use super::super::sketch::Sketch;
-use crate::gradcheck::{Bug, Precision, Scene, run};
+use crate::gradcheck::{Bug, Precision, Scene, relative_l2, run};
 
 pub(super) const CASES: [Case; 3] = [
     Case::scenes(
@@ -68,7 +66,7 @@ fn direction(device: &Device) -> Result<Outcome, AccuracyError> {
     )?;
     let with = double(&scene)?;
     let lost = |array: fn(&crate::gradcheck::Inputs) -> &crate::gradcheck::Array| {
-        relative(
+        relative_l2(
             &array(&without.gradients).values,
             &array(&with.gradients).values,
         )

@@ -7,9 +7,9 @@ use splat_model::losses::{SsimSettings, ssim};
 use splat_model::{CameraTensors, EditLog, Gaussians, RenderSettings, SplatAdam, render};
 
 use super::super::case::Case;
-use super::super::measure::{AccuracyError, Outcome, clear, double, relative, single};
+use super::super::measure::{AccuracyError, Outcome, clear, double, single};
 use super::super::sketch::Sketch;
-use crate::gradcheck::{Array, Computed, Scene};
+use crate::gradcheck::{Array, Computed, Scene, relative_l2};
 
 pub(super) const CASES: [Case; 4] = [
     Case::own(
@@ -97,11 +97,11 @@ fn opacity_logits(device: &Device) -> Result<Outcome, AccuracyError> {
     // can only be about zero.
     let error = |i: usize| match expected[i].abs() < f64::from(f32::MIN_POSITIVE) {
         true => gradient[i].abs().min(1.0),
-        false => relative(&gradient[i..=i], &expected[i..=i]),
+        false => relative_l2(&gradient[i..=i], &expected[i..=i]),
     };
     let worst = (0..logits.len()).map(error).fold(0.0, f64::max);
     let outcome = Outcome {
-        forward: relative(&image, &reference.outputs.image.values),
+        forward: relative_l2(&image, &reference.outputs.image.values),
         gradient: worst,
         worst_group: "opacity_logits".into(),
         ..Outcome::new()
@@ -248,11 +248,11 @@ fn ssim_patches(device: &Device) -> Result<Outcome, AccuracyError> {
     ] {
         let [loss, gradient] = measure([image, target], device, DType::F32)?;
         let [exact_loss, exact] = measure([image, target], &Device::flex(), DType::F64)?;
-        outcome.forward = outcome.forward.max(relative(&loss, &exact_loss));
+        outcome.forward = outcome.forward.max(relative_l2(&loss, &exact_loss));
         // At its maximum SSIM has no gradient; what is left is measured against that of a visible difference.
         let largest = exact.iter().fold(0.0f64, |m, g| m.max(g.abs()));
         if largest > 1e-12 {
-            outcome.gradient = outcome.gradient.max(relative(&gradient, &exact));
+            outcome.gradient = outcome.gradient.max(relative_l2(&gradient, &exact));
         }
         let scale = largest.max(1.0 / count as f64);
         let off = gradient
@@ -298,7 +298,7 @@ fn adam_spike(device: &Device) -> Result<Outcome, AccuracyError> {
         x
     });
     let outcome = Outcome {
-        forward: relative(&ours, &exact),
+        forward: relative_l2(&ours, &exact),
         ..Outcome::new()
     };
     let holds = outcome.forward <= 1e-6;

@@ -3,9 +3,9 @@
 use burn::tensor::Device;
 
 use super::super::case::{Case, Check};
-use super::super::measure::{AccuracyError, Outcome, against_double, clear, relative, single};
+use super::super::measure::{AccuracyError, Outcome, against_double, clear, single};
 use super::super::sketch::{Sketch, about_z};
-use crate::gradcheck::Scene;
+use crate::gradcheck::{Scene, relative_l2};
 
 pub(super) const CASES: [Case; 10] = [
     Case::scenes(
@@ -188,7 +188,7 @@ fn quaternion_multiples(device: &Device) -> Result<Outcome, AccuracyError> {
     let long = make(5.0);
     let fivefold = single(&long, device)?;
     let image = |c: &crate::gradcheck::Computed| c.outputs.image.values.clone();
-    let off = relative(&image(&fivefold), &image(&plain));
+    let off = relative_l2(&image(&fivefold), &image(&plain));
     let radial = (0..12).map(|n| {
         let q = &long.inputs.quats.values[4 * n..4 * n + 4];
         let g = &fivefold.gradients.quats.values[4 * n..4 * n + 4];
