@@ -21,6 +21,8 @@ use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use burn::tensor::DType;
 
+pub use rasterize::{RasterizeWork, rasterize_work};
+
 use crate::adam::AdamStep;
 use crate::backend::SplatBackend;
 use crate::settings::{ProjectArgs, RasterizeArgs};
