@@ -5,13 +5,14 @@ use core::fmt::Debug;
 
 use burn::backend::{
     Backend, ExtensionType, TensorMetadata, backend_extension, get_or_init_device_settings,
-    tensor::FloatTensor,
+    tensor::{FloatTensor, IntTensor},
 };
 // The expansion of `#[backend_extension]` names these.
 #[allow(unused_imports)]
 use burn::backend::{Autodiff, Dispatch};
 
 use crate::adam::AdamStep;
+use crate::composed;
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
 
@@ -98,28 +99,15 @@ pub trait SplatBackend: Backend {
     /// outside. Linear and self-adjoint: its own vector-Jacobian product.
     fn gaussian_blur(image: FloatTensor<Self>, window: &[f64]) -> FloatTensor<Self>;
 
-    /// [`ssim_map`](crate::ssim_map) of two images, and what the backend keeps for the gradient. Composed of tensor ops
-    /// unless a backend knows better: the windowed means of x, y, x^2 + y^2 and xy.
+    /// [`ssim_map`](crate::ssim_map) of two images, and what the backend keeps for the gradient.
     fn ssim_forward(
         images: [FloatTensor<Self>; 2],
         args: &SsimArgs,
     ) -> (FloatTensor<Self>, Vec<FloatTensor<Self>>) {
-        let [x, y] = images;
-        let square = |v: &FloatTensor<Self>| Self::float_mul(v.clone(), v.clone());
-        let squares = Self::float_add(square(&x), square(&y));
-        let product = Self::float_mul(x.clone(), y.clone());
-        let moments: Vec<_> = [x, y, squares, product]
-            .into_iter()
-            .map(|image| <Self as SplatBackend>::gaussian_blur(image, &args.window))
-            .collect();
-        let [a, b, c, d] = ssim_terms::<Self>(&moments, args);
-        (
-            Self::float_div(Self::float_mul(a, c), Self::float_mul(b, d)),
-            moments,
-        )
+        composed::ssim_forward::<Self>(images, args)
     }
 
-    /// Gradients of both images, given that of the map; see the formulas in `cpu/ssim.rs`.
+    /// Gradients of both images, given that of the map.
     fn ssim_backward(
         images: [FloatTensor<Self>; 2],
         moments: Vec<FloatTensor<Self>>,
@@ -127,34 +115,35 @@ pub trait SplatBackend: Backend {
         args: &SsimArgs,
         wanted: [bool; 2],
     ) -> [Option<FloatTensor<Self>>; 2] {
-        let [x, y] = images;
-        let [a, b, c, d] = ssim_terms::<Self>(&moments, args);
-        let mul =
-            |l: &FloatTensor<Self>, r: &FloatTensor<Self>| Self::float_mul(l.clone(), r.clone());
-        let div =
-            |l: &FloatTensor<Self>, r: &FloatTensor<Self>| Self::float_div(l.clone(), r.clone());
-        let twice = |v: FloatTensor<Self>| Self::float_mul_scalar(v, 2.0.into());
-        let blur = |v: FloatTensor<Self>| <Self as SplatBackend>::gaussian_blur(v, &args.window);
+        composed::ssim_backward::<Self>(images, moments, grad, args, wanted)
+    }
 
-        let scaled = div(&grad, &mul(&b, &d));
-        let weighted = mul(&scaled, &mul(&a, &c));
-        let slope = Self::float_sub(div(&weighted, &d), div(&weighted, &b));
-        let contrast = mul(&scaled, &Self::float_sub(c, a.clone()));
-        let by_squares = twice(blur(Self::float_neg(div(&weighted, &d))));
-        let by_product = blur(twice(mul(&scaled, &a)));
-        let gradient = |own: &FloatTensor<Self>, other: &FloatTensor<Self>, mine: usize| {
-            let theirs = 1 - mine;
-            let by_mean = blur(twice(Self::float_add(
-                mul(&moments[theirs], &contrast),
-                mul(&moments[mine], &slope),
-            )));
-            let rest = Self::float_add(mul(own, &by_squares), mul(other, &by_product));
-            Self::float_add(by_mean, rest)
-        };
-        [
-            wanted[0].then(|| gradient(&x, &y, 0)),
-            wanted[1].then(|| gradient(&y, &x, 1)),
-        ]
+    /// Means `[2]` of [`photometric`](crate::photometric).
+    fn photometric(
+        rendered: FloatTensor<Self>,
+        target: Target<Self>,
+        args: &SsimArgs,
+    ) -> FloatTensor<Self> {
+        composed::photometric::<Self>(rendered, target, args)
+    }
+
+    /// The same, and the gradient `[B, H, W, D]` of the mean similarity by what was rendered.
+    fn photometric_tracked(
+        rendered: FloatTensor<Self>,
+        target: Target<Self>,
+        args: &SsimArgs,
+    ) -> (FloatTensor<Self>, FloatTensor<Self>) {
+        composed::photometric_tracked::<Self>(rendered, target, args)
+    }
+
+    /// Gradient `[B, H, W, E]` of what was rendered, given that of the similarity and the gradient `[2]` of the means.
+    fn photometric_backward(
+        rendered: FloatTensor<Self>,
+        target: Target<Self>,
+        slope: FloatTensor<Self>,
+        grad: FloatTensor<Self>,
+    ) -> FloatTensor<Self> {
+        composed::photometric_backward::<Self>(rendered, target, slope, grad)
     }
 
     /// Parameter, gradient and both moments to parameter and moments after
@@ -183,23 +172,6 @@ pub trait SplatBackend: Backend {
     }
 }
 
-/// A, B, C, D of the structural similarity `A C / (B D)`, from the four windowed means.
-fn ssim_terms<B: Backend>(moments: &[FloatTensor<B>], args: &SsimArgs) -> [FloatTensor<B>; 4] {
-    let [mx, my, q, p] = [0, 1, 2, 3].map(|i| moments[i].clone());
-    let product = B::float_mul(mx.clone(), my.clone());
-    let squares = B::float_add(B::float_mul(mx.clone(), mx), B::float_mul(my.clone(), my));
-    let twice_and = |v, constant: f64| {
-        let twice = B::float_mul_scalar(v, 2.0.into());
-        B::float_add_scalar(twice, constant.into())
-    };
-    [
-        twice_and(product.clone(), args.c1),
-        B::float_add_scalar(squares.clone(), args.c1.into()),
-        twice_and(B::float_sub(p, product), args.c2),
-        B::float_add_scalar(B::float_sub(q, squares), args.c2.into()),
-    ]
-}
-
 /// A parameter and its moments, in the form in which Burn's dispatch can carry them.
 #[derive(ExtensionType)]
 pub(crate) struct AdamTensors<B: Backend> {
@@ -215,6 +187,16 @@ pub(crate) enum Background<B: Backend> {
     Color(FloatTensor<B>),
     /// Nothing lies behind the splats.
     None,
+}
+
+/// What [`photometric`](crate::photometric) compares with, `[B, H, W, D]`, in the form in which Burn's dispatch can
+/// carry it.
+#[derive(Debug, Clone, ExtensionType)]
+pub enum Target<B: Backend> {
+    /// Of any integer type, 0 to 255, for `level / 255`.
+    Levels(IntTensor<B>),
+    /// As they are.
+    Values(FloatTensor<B>),
 }
 
 /// The forward ops as Burn dispatches them: to Flex, to CubeCL, or through autodiff to either.
@@ -246,6 +228,12 @@ pub(crate) trait SplatOps: Backend {
     fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self>;
 
     fn ssim(x: FloatTensor<Self>, y: FloatTensor<Self>, args: SsimArgs) -> FloatTensor<Self>;
+
+    fn photometric(
+        rendered: FloatTensor<Self>,
+        #[extension_type] target: Target<Self>,
+        args: SsimArgs,
+    ) -> FloatTensor<Self>;
 
     fn adam(
         param: FloatTensor<Self>,
@@ -303,6 +291,14 @@ macro_rules! forward_only {
                 args: SsimArgs,
             ) -> FloatTensor<Self> {
                 Self::ssim_forward([x, y], &args).0
+            }
+
+            fn photometric(
+                rendered: FloatTensor<Self>,
+                target: Target<Self>,
+                args: SsimArgs,
+            ) -> FloatTensor<Self> {
+                <Self as SplatBackend>::photometric(rendered, target, &args)
             }
 
             fn adam(

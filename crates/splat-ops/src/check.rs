@@ -1,7 +1,7 @@
 //! Checks of inputs that all ops share.
 
 use burn::backend::DispatchDevice;
-use burn::tensor::{DType, Device, Tensor};
+use burn::tensor::{DType, Device, Tensor, kind::Basic};
 
 use crate::OpError;
 
@@ -44,6 +44,25 @@ impl Checker {
         shape: [Option<usize>; R],
         expected: &'static str,
     ) -> Result<(), OpError> {
+        self.place(name, tensor, shape, expected)?;
+        if tensor.dtype() != self.dtype {
+            return Err(self.dtype_error(
+                name,
+                tensor.dtype(),
+                "all tensors of one call must have the same type",
+            ));
+        }
+        Ok(())
+    }
+
+    /// A tensor of any kind and type, on the same device, of the given shape.
+    pub(crate) fn place<const R: usize, K: Basic>(
+        &self,
+        name: &'static str,
+        tensor: &Tensor<R, K>,
+        shape: [Option<usize>; R],
+        expected: &'static str,
+    ) -> Result<(), OpError> {
         let got = tensor.dims();
         let fits = shape
             .iter()
@@ -56,13 +75,6 @@ impl Checker {
                 expected,
                 got: got.to_vec(),
             });
-        }
-        if tensor.dtype() != self.dtype {
-            return Err(self.dtype_error(
-                name,
-                tensor.dtype(),
-                "all tensors of one call must have the same type",
-            ));
         }
         if tensor.device().without_autodiff() != self.device {
             return Err(self.argument(format!(

@@ -26,11 +26,13 @@ mod adam;
 mod autodiff;
 mod blur;
 mod check;
+mod composed;
 #[cfg(feature = "cpu")]
 pub mod cpu;
 #[cfg(feature = "cube")]
 mod cube;
 mod error;
+mod photometric;
 mod project;
 mod rasterize;
 mod spherical_harmonics;
@@ -43,6 +45,7 @@ pub use blur::gaussian_blur;
 #[cfg(feature = "cpu")]
 pub use cpu::{RasterizeWork, rasterize_work};
 pub use error::{ErrorSlot, OpError};
+pub use photometric::{Photometric, Target, photometric};
 pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};
 pub use settings::{ImageSize, ProjectSettings, RasterizeSettings};

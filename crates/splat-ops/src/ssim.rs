@@ -1,5 +1,7 @@
 //! Structural similarity, pixel by pixel (Wang et al. 2004, eq. 13).
 
+use core::ops::Range;
+
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 
@@ -35,4 +37,15 @@ pub fn ssim_map(x: Tensor<4>, y: Tensor<4>, args: &SsimArgs) -> Result<Tensor<4>
     check.window(&args.window)?;
     let map = <Dispatch as SplatOps>::ssim(x.into_dispatch(), y.into_dispatch(), args.clone());
     Ok(Tensor::from_dispatch(map))
+}
+
+/// The rows and columns of the pixels of an image of `[height, width]` whose window lies inside; all of them where there
+/// is none.
+pub(crate) fn counted([height, width]: [usize; 2], window: usize) -> [Range<usize>; 2] {
+    let radius = if height < window || width < window {
+        0
+    } else {
+        window / 2
+    };
+    [height, width].map(|length| radius..length - radius)
 }

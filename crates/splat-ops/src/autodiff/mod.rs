@@ -3,6 +3,7 @@
 //! of the backend.
 
 mod blur;
+mod photometric;
 mod project;
 mod rasterize;
 mod spherical_harmonics;
@@ -14,7 +15,7 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::{Autodiff, AutodiffBackend, tensor::FloatTensor};
 
 use crate::adam::AdamStep;
-use crate::backend::{AdamTensors, Background, SplatBackend, SplatOps};
+use crate::backend::{AdamTensors, Background, SplatBackend, SplatOps, Target};
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
 
@@ -54,6 +55,14 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
 
     fn ssim(x: FloatTensor<Self>, y: FloatTensor<Self>, args: SsimArgs) -> FloatTensor<Self> {
         ssim::ssim::<B, C>([x, y], args)
+    }
+
+    fn photometric(
+        rendered: FloatTensor<Self>,
+        target: Target<Self>,
+        args: SsimArgs,
+    ) -> FloatTensor<Self> {
+        photometric::photometric::<B, C>(rendered, target, args)
     }
 
     /// An optimiser's step is no part of any graph: what comes out is new leaves.

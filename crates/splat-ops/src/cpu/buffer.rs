@@ -2,7 +2,7 @@
 
 use burn::backend::TensorMetadata;
 use burn::backend::flex::FlexTensor;
-use burn::tensor::TensorData;
+use burn::tensor::{Element, TensorData};
 
 use super::real::Real;
 
@@ -52,7 +52,7 @@ impl Buffer {
     }
 
     /// The elements. The caller has chosen `T` by the tensor's type.
-    pub(super) fn slice<T: Real>(&self) -> &[T] {
+    pub(super) fn slice<T: Element + bytemuck::Pod>(&self) -> &[T] {
         self.tensor
             .as_slice()
             .expect("a contiguous tensor of the type its op dispatched on")

@@ -8,6 +8,7 @@ mod blur;
 pub(crate) mod buffer;
 mod intersect;
 mod math;
+mod photometric;
 #[cfg(test)]
 pub(crate) mod poison;
 mod project;
@@ -15,7 +16,6 @@ mod rasterize;
 pub(crate) mod real;
 mod simd;
 mod spherical_harmonics;
-mod ssim;
 
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
@@ -24,7 +24,7 @@ use burn::tensor::DType;
 pub use rasterize::{RasterizeWork, rasterize_work};
 
 use crate::adam::AdamStep;
-use crate::backend::SplatBackend;
+use crate::backend::{SplatBackend, Target};
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
 
@@ -146,25 +146,37 @@ impl SplatBackend for Flex {
         in_precision!(image, blur::blur, image, window)
     }
 
-    fn ssim_forward(images: [FlexTensor; 2], args: &SsimArgs) -> (FlexTensor, Vec<FlexTensor>) {
-        in_precision!(images[0], ssim::forward, images, args)
+    fn photometric(rendered: FlexTensor, target: Target<Self>, args: &SsimArgs) -> FlexTensor {
+        in_precision!(rendered, photometric::measure, rendered, target, args)
     }
 
-    fn ssim_backward(
-        images: [FlexTensor; 2],
-        moments: Vec<FlexTensor>,
-        grad: FlexTensor,
+    fn photometric_tracked(
+        rendered: FlexTensor,
+        target: Target<Self>,
         args: &SsimArgs,
-        wanted: [bool; 2],
-    ) -> [Option<FlexTensor>; 2] {
+    ) -> (FlexTensor, FlexTensor) {
         in_precision!(
-            images[0],
-            ssim::backward,
-            images,
-            moments,
-            grad,
-            args,
-            wanted
+            rendered,
+            photometric::measure_tracked,
+            rendered,
+            target,
+            args
+        )
+    }
+
+    fn photometric_backward(
+        rendered: FlexTensor,
+        target: Target<Self>,
+        slope: FlexTensor,
+        grad: FlexTensor,
+    ) -> FlexTensor {
+        in_precision!(
+            rendered,
+            photometric::backward,
+            rendered,
+            target,
+            slope,
+            grad
         )
     }
 

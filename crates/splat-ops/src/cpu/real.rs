@@ -41,6 +41,8 @@ pub(crate) trait Real:
     fn of(value: f64) -> Self;
     /// Widened, or unchanged.
     fn wide(self) -> f64;
+    /// `level / 255`.
+    fn of_level(level: u8) -> Self;
     fn sqrt(self) -> Self;
     fn ln(self) -> Self;
     fn abs(self) -> Self;
@@ -79,11 +81,17 @@ impl Real for f64 {
         self.round_ties_even() as i32
     }
 
+    #[inline(always)]
     fn of(value: f64) -> Self {
         value
     }
+    #[inline(always)]
     fn wide(self) -> f64 {
         self
+    }
+    #[inline(always)]
+    fn of_level(level: u8) -> Self {
+        f64::from(level) / 255.0
     }
     #[inline(always)]
     fn sqrt(self) -> Self {
@@ -129,8 +137,13 @@ impl Real for f32 {
     fn of(value: f64) -> Self {
         value as f32
     }
+    #[inline(always)]
     fn wide(self) -> f64 {
         self as f64
+    }
+    #[inline(always)]
+    fn of_level(level: u8) -> Self {
+        f32::from(level) / 255.0
     }
     #[inline(always)]
     fn sqrt(self) -> Self {

@@ -9,10 +9,10 @@
 macro_rules! vectorized {
     (
         $(#[$meta:meta])*
-        fn $name:ident<T: Real, const FMA: bool>($($argument:ident: $type:ty),* $(,)?) $(-> $result:ty)? $body:block
+        $vis:vis fn $name:ident<T: Real, const FMA: bool>($($argument:ident: $type:ty),* $(,)?) $(-> $result:ty)? $body:block
     ) => {
         $(#[$meta])*
-        fn $name<T: Real>($($argument: $type),*) $(-> $result)? {
+        $vis fn $name<T: Real>($($argument: $type),*) $(-> $result)? {
             #[inline(always)]
             fn body<T: Real, const FMA: bool>($($argument: $type),*) $(-> $result)? $body
 

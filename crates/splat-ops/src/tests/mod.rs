@@ -1,6 +1,7 @@
 //! What must hold on every backend: the native path, and the kernels where there is an adapter.
 
 mod decisions;
+mod photometric;
 mod poison;
 
 use burn::tensor::Device;

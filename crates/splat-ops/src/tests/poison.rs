@@ -8,7 +8,7 @@ use rand_pcg::Pcg32;
 use super::devices;
 use crate::{
     AdamStep, ImageSize, ProjectSettings, RasterizeSettings, SsimArgs, adam_step, gaussian_blur,
-    project, rasterize, spherical_harmonics, ssim_map,
+    photometric, project, rasterize, spherical_harmonics, ssim_map,
 };
 
 fn poison(on: bool) {
@@ -87,7 +87,11 @@ impl Scene {
             c2: 9e-4,
         };
         let similarity = ssim_map(blurred.clone(), rendered.packed(), &args).unwrap();
+        let target = blurred.clone().detach().narrow(3, 0, d);
+        let measured = photometric(rendered.packed(), target, &args).unwrap();
+        let averages = Tensor::cat(vec![measured.l1, measured.ssim], 0);
         let mut loss = blurred.clone().square().sum() + similarity.clone().square().sum();
+        loss = loss + averages.clone().square().sum();
         if n > 0 {
             loss = loss + harmonics.clone().square().sum();
         }
@@ -104,6 +108,7 @@ impl Scene {
             ("rendered", bits(rendered.packed().into_data())),
             ("blurred", bits(blurred.into_data())),
             ("similarity", bits(similarity.into_data())),
+            ("averages", bits(averages.into_data())),
         ];
         for (name, leaf) in [
             ("means", &means),
@@ -167,7 +172,7 @@ fn reserved_memory_is_written_before_it_is_read() {
             poison(false);
             let case = format!("{name}: C = {cameras}, N = {gaussians}, D = {channels}");
             // With no splats some gradients are of nothing; otherwise all ten are there.
-            assert!(gaussians == 0 || clean.len() == 18, "{case}");
+            assert!(gaussians == 0 || clean.len() == 19, "{case}");
             for ((part, clean), (_, poisoned)) in clean.iter().zip(&poisoned) {
                 assert!(clean == poisoned, "{case}: {part} differs");
             }

@@ -1,0 +1,116 @@
+//! Mean absolute difference and mean structural similarity of two pictures in one sweep over their rows, and with it
+//! the gradient of the similarity. The gradient of the loss is then one more pass.
+
+mod pictures;
+mod rows;
+mod sweep;
+
+use core::marker::PhantomData;
+use core::ops::Range;
+
+use burn::backend::flex::FlexTensor;
+use burn::backend::{Flex, TensorMetadata};
+use rayon::prelude::*;
+
+use super::buffer::{Buffer, overwritten, tensor};
+use super::real::Real;
+use crate::backend::Target;
+use crate::ssim::SsimArgs;
+use pictures::{Pictures, spread};
+use sweep::{Scratch, Sweep};
+
+/// Rows per unit of parallel work. Fixed, so that sums are the same on any number of threads.
+const BAND: usize = 48;
+
+/// Means `[2]` of absolute difference and similarity.
+pub(super) fn measure<T: Real>(
+    _: PhantomData<T>,
+    rendered: FlexTensor,
+    target: Target<Flex>,
+    args: &SsimArgs,
+) -> FlexTensor {
+    means::<T>(&Pictures::new(rendered, target), args, None)
+}
+
+/// The same, and the gradient of the mean similarity.
+pub(super) fn measure_tracked<T: Real>(
+    _: PhantomData<T>,
+    rendered: FlexTensor,
+    target: Target<Flex>,
+    args: &SsimArgs,
+) -> (FlexTensor, FlexTensor) {
+    let pictures = Pictures::new(rendered, target);
+    let mut slope = overwritten::<T>(pictures.shape.iter().product());
+    let means = means(&pictures, args, Some(&mut slope));
+    (means, tensor(slope, pictures.shape))
+}
+
+fn means<T: Real>(pictures: &Pictures, args: &SsimArgs, slope: Option<&mut [T]>) -> FlexTensor {
+    let [b, h, w, d] = pictures.shape;
+    let sweep = Sweep::<T>::new(pictures, args);
+    let mut bands: Vec<Band<T>> = (0..b)
+        .flat_map(|image| (0..h).step_by(BAND).map(move |first| (image, first)))
+        .map(|(image, first)| Band {
+            image,
+            rows: first..(first + BAND).min(h),
+            slope: None,
+        })
+        .collect();
+    if let Some(slope) = slope.filter(|slope| !slope.is_empty()) {
+        let pieces = slope
+            .chunks_exact_mut(h * w * d)
+            .flat_map(|image| image.chunks_mut(BAND * w * d));
+        for (band, piece) in bands.iter_mut().zip(pieces) {
+            band.slope = Some(piece);
+        }
+    }
+    let sums: Vec<[f64; 2]> = bands
+        .into_par_iter()
+        .map_init(Scratch::default, |scratch, band| {
+            sweep.band(band.image, band.rows, band.slope, scratch)
+        })
+        .collect();
+    let counts = [b * h * w * d, sweep.count];
+    let means = [0, 1].map(|i| {
+        let sum: f64 = sums.iter().map(|sums| sums[i]).sum();
+        T::of(sum / counts[i] as f64)
+    });
+    tensor(means.to_vec(), [2])
+}
+
+/// Rows of one image, and where the gradient of the similarity goes, if anywhere.
+struct Band<'a, T> {
+    image: usize,
+    rows: Range<usize>,
+    slope: Option<&'a mut [T]>,
+}
+
+/// Gradient of `rendered`, given that of the means and what [`forward`] left.
+pub(super) fn backward<T: Real>(
+    _: PhantomData<T>,
+    rendered: FlexTensor,
+    target: Target<Flex>,
+    slope: FlexTensor,
+    grad: FlexTensor,
+) -> FlexTensor {
+    let [.., e] = rendered.shape().dims::<4>();
+    let pictures = Pictures::new(rendered, target);
+    let [b, h, w, d] = pictures.shape;
+    let [slope, grad] = [slope, grad].map(Buffer::new);
+    let (slope, grad) = (slope.slice::<T>(), grad.slice::<T>());
+    let weights = [grad[0] / T::of((b * h * w * d) as f64), grad[1]];
+    let rows = pictures.rows::<T>();
+    let mut out = overwritten::<T>(b * h * w * e);
+    if !out.is_empty() {
+        out.par_chunks_mut(w * e).enumerate().for_each_init(
+            || [(); 3].map(|()| vec![T::ZERO; w * d]),
+            |[x, y, gradient], (row, out)| {
+                rows.load(row, 0..w, x, y);
+                let slope = &slope[row * w * d..(row + 1) * w * d];
+                rows::gradient([x, y, slope], weights, gradient);
+                spread([d, e], gradient, out);
+            },
+        );
+    }
+    tensor(out, [b, h, w, e])
+}

@@ -1,0 +1,264 @@
+//! The sweep over the rows of a picture.
+//!
+//! ```text
+//! S = A C / (B D),  A = 2 mx my + c1,  B = mx^2 + my^2 + c1,  C = 2 (p - mx my) + c2,  D = q - mx^2 - my^2 + c2
+//! d(sum S)/dx = blur(dS/dmx) + 2 x blur(dS/dq) + y blur(dS/dp)
+//! ```
+//!
+//! mx, my, q, p being the windowed means of x, y, x^2 + y^2, xy; outside of the pixels that count the three derivatives,
+//! the fields, are zero.
+//!
+//! A band of rows is one unit of parallel work; it goes down a strip of columns at a time. What the window reaches over
+//! is kept in rings, as many rows as the window has: of the pictures, and of the fields. A step makes one row of fields,
+//! a radius above the last row of the pictures, and with it one row of the gradient, a radius higher. What the window
+//! reaches over beyond a band or a strip is computed by both neighbours.
+
+use core::ops::Range;
+
+use super::pictures::{Pictures, Rows};
+use super::rows;
+use crate::cpu::real::Real;
+use crate::ssim::{SsimArgs, counted};
+
+/// Most pixels of a strip: its rings stay in a core's second-level cache.
+const STRIP: usize = 256;
+/// mx, my, q, p.
+pub(super) const MOMENTS: usize = 4;
+/// Derivatives by mx, q, p, all but the second halved.
+pub(super) const FIELDS: usize = 3;
+
+/// What is the same for all bands.
+pub(super) struct Sweep<'a, T> {
+    rows: Rows<'a, T>,
+    height: usize,
+    /// Rows and columns of the pixels that count.
+    counted: [Range<isize>; 2],
+    /// How many values count.
+    pub(super) count: usize,
+    window: Vec<T>,
+    constants: [T; 2],
+}
+
+impl<'a, T: Real> Sweep<'a, T> {
+    pub(super) fn new(pictures: &'a Pictures, args: &SsimArgs) -> Self {
+        let [b, h, w, d] = pictures.shape;
+        let counted = counted([h, w], args.window.len());
+        let [rows, columns] = counted.clone().map(|range| range.len());
+        Self {
+            rows: pictures.rows(),
+            height: h,
+            counted: counted.map(|range| range.start as isize..range.end as isize),
+            count: b * rows * columns * d,
+            window: args.window.iter().map(|weight| T::of(*weight)).collect(),
+            constants: [args.c1, args.c2].map(T::of),
+        }
+    }
+
+    /// Sums of absolute difference and similarity over `rows` of an image. `slope` is the memory of these rows, for the
+    /// gradient of the mean similarity.
+    pub(super) fn band(
+        &self,
+        image: usize,
+        rows: Range<usize>,
+        mut slope: Option<&mut [T]>,
+        scratch: &mut Scratch<T>,
+    ) -> [f64; 2] {
+        let (width, channels) = (self.rows.width, self.rows.channels);
+        let rows = rows.start as isize..rows.end as isize;
+        let radius = (self.window.len() / 2) as isize;
+        // Rows of fields that a gradient needs beyond its own.
+        let reach = if slope.is_some() { radius } else { 0 };
+        let strips = width.div_ceil(STRIP);
+        let mut sums = [0.0; 2];
+        for index in 0..strips {
+            let columns = index * width / strips..(index + 1) * width / strips;
+            let strip = Strip::new(self, image, columns.clone());
+            scratch.clear(self.window.len(), strip.length);
+            for row in rows.start - reach - radius..rows.end + reach + radius {
+                let difference = strip.load(row, scratch);
+                if rows.contains(&row) {
+                    sums[0] += difference;
+                }
+                // From here on all rows under the window are there.
+                let row = row - radius;
+                if row < rows.start - reach {
+                    continue;
+                }
+                let similarity = strip.fields(row, scratch);
+                if rows.contains(&row) {
+                    sums[1] += similarity;
+                }
+                let row = row - radius;
+                if let Some(slope) = slope.as_deref_mut().filter(|_| row >= rows.start) {
+                    let start = (row - rows.start) as usize * width;
+                    let out = (start + columns.start) * channels..(start + columns.end) * channels;
+                    strip.slope(row, scratch, &mut slope[out]);
+                }
+            }
+        }
+        sums
+    }
+}
+
+/// Memory that the bands of a thread share.
+pub(super) struct Scratch<T> {
+    /// Per row of the ring x and y.
+    pictures: Vec<T>,
+    /// Per row of the ring the fields.
+    fields: Vec<T>,
+    /// Rows blurred down the columns.
+    blurred: Vec<T>,
+    /// A row of results.
+    results: Vec<T>,
+}
+
+impl<T> Default for Scratch<T> {
+    fn default() -> Self {
+        let [pictures, fields, blurred, results] = [(); 4].map(|()| Vec::new());
+        Self {
+            pictures,
+            fields,
+            blurred,
+            results,
+        }
+    }
+}
+
+impl<T: Real> Scratch<T> {
+    /// Zeros: pixels outside of the picture, and fields of pixels that do not count, are not written.
+    fn clear(&mut self, ring: usize, length: usize) {
+        for (memory, rows) in [
+            (&mut self.pictures, 2 * ring),
+            (&mut self.fields, FIELDS * ring),
+            (&mut self.blurred, MOMENTS),
+            (&mut self.results, 1),
+        ] {
+            memory.clear();
+            memory.resize(rows * length, T::ZERO);
+        }
+    }
+}
+
+/// A strip of a band. Rows in memory have two radii of pixels on either side of it: fields are needed one radius beyond
+/// it, and pictures another.
+struct Strip<'a, T> {
+    sweep: &'a Sweep<'a, T>,
+    image: usize,
+    columns: Range<isize>,
+    radius: isize,
+    /// Values of a row in memory.
+    length: usize,
+}
+
+impl<'a, T: Real> Strip<'a, T> {
+    fn new(sweep: &'a Sweep<'a, T>, image: usize, columns: Range<usize>) -> Self {
+        let radius = sweep.window.len() / 2;
+        Self {
+            sweep,
+            image,
+            length: rows::padded((columns.len() + 4 * radius) * sweep.rows.channels),
+            columns: columns.start as isize..columns.end as isize,
+            radius: radius as isize,
+        }
+    }
+
+    /// The strip with a margin, as far as it lies in `within`.
+    fn with_margin(&self, margin: isize, within: &Range<isize>) -> Range<isize> {
+        let start = (self.columns.start - margin).max(within.start);
+        start..(self.columns.end + margin).min(within.end).max(start)
+    }
+
+    /// Where columns lie in a row in memory.
+    fn values(&self, columns: &Range<isize>) -> Range<usize> {
+        let origin = self.columns.start - 2 * self.radius;
+        let at = |column| (column - origin) as usize * self.sweep.rows.channels;
+        at(columns.start)..at(columns.end)
+    }
+
+    /// The place of a row in a ring of N rows per row.
+    fn place<const N: usize>(&self, row: isize) -> Range<usize> {
+        let slot = row.rem_euclid(self.sweep.window.len() as isize) as usize;
+        slot * N * self.length..(slot + 1) * N * self.length
+    }
+
+    /// The rows of a ring under the window around `row`, from above.
+    fn under_window<'m, const N: usize>(&self, ring: &'m [T], row: isize) -> Vec<[&'m [T]; N]> {
+        (row - self.radius..=row + self.radius)
+            .map(|row| split(&ring[self.place::<N>(row)], self.length))
+            .collect()
+    }
+
+    /// Takes in a row of the pictures, zeros outside. The strip's sum of absolute differences.
+    fn load(&self, row: isize, scratch: &mut Scratch<T>) -> f64 {
+        let Sweep { rows, height, .. } = self.sweep;
+        let memory = &mut scratch.pictures[self.place::<2>(row)];
+        if !(0..*height as isize).contains(&row) {
+            memory.fill(T::ZERO);
+            return 0.0;
+        }
+        let within = self.with_margin(2 * self.radius, &(0..rows.width as isize));
+        let values = self.values(&within);
+        let (x, y) = memory.split_at_mut(self.length);
+        let columns = within.start as usize..within.end as usize;
+        let row = self.image * height + row as usize;
+        rows.load(row, columns, &mut x[values.clone()], &mut y[values]);
+        let own = self.values(&self.columns);
+        rows::sum_of_differences(&x[own.clone()], &y[own])
+    }
+
+    /// Makes a row of fields, zero where no pixel counts. The strip's sum of similarities.
+    fn fields(&self, row: isize, scratch: &mut Scratch<T>) -> f64 {
+        let [counted, columns] = &self.sweep.counted;
+        let fields = &mut scratch.fields[self.place::<FIELDS>(row)];
+        let within = self.with_margin(self.radius, columns);
+        if !counted.contains(&row) || within.is_empty() {
+            fields.fill(T::ZERO);
+            return 0.0;
+        }
+        let window = &self.sweep.window;
+        let pictures = self.under_window::<2>(&scratch.pictures, row);
+        let mut blurred = split_mut(&mut scratch.blurred, self.length);
+        rows::moments_down::<T>(&pictures, window, &mut blurred);
+        rows::fields_along(
+            blurred.map(|row| &*row),
+            self.values(&within),
+            self.sweep.rows.channels,
+            window,
+            self.sweep.constants,
+            &mut split_mut(fields, self.length),
+            &mut scratch.results,
+        );
+        let own = self.values(&self.with_margin(0, columns));
+        rows::sum(&scratch.results[own])
+    }
+
+    /// Makes a row of the gradient.
+    fn slope(&self, row: isize, scratch: &mut Scratch<T>, out: &mut [T]) {
+        let window = &self.sweep.window;
+        let fields = self.under_window::<FIELDS>(&scratch.fields, row);
+        let mut blurred = split_mut(&mut scratch.blurred, self.length);
+        rows::fields_down(&fields, window, &mut blurred);
+        let own = self.values(&self.columns);
+        rows::slope_along(
+            blurred.map(|row| &*row),
+            split(&scratch.pictures[self.place::<2>(row)], self.length),
+            own.clone(),
+            self.sweep.rows.channels,
+            window,
+            T::of(2.0 / self.sweep.count as f64),
+            &mut scratch.results,
+        );
+        out.copy_from_slice(&scratch.results[own]);
+    }
+}
+
+/// The first N rows.
+fn split<T, const N: usize>(memory: &[T], length: usize) -> [&[T]; N] {
+    core::array::from_fn(|n| &memory[n * length..(n + 1) * length])
+}
+
+/// The first N rows.
+fn split_mut<T, const N: usize>(memory: &mut [T], length: usize) -> [&mut [T]; N] {
+    let mut rows = memory.chunks_exact_mut(length);
+    core::array::from_fn(|_| rows.next().unwrap_or_default())
+}

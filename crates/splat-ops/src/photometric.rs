@@ -1,0 +1,90 @@
+//! The photometric loss of splatting: L1 and structural similarity of what was rendered and a photo.
+
+use burn::backend::Dispatch;
+use burn::tensor::{Int, Tensor};
+
+use crate::OpError;
+use crate::backend::{self, SplatOps};
+use crate::check::Checker;
+use crate::ssim::SsimArgs;
+
+/// What [`photometric`] compares with, `[B, H, W, D]`.
+#[derive(Debug, Clone)]
+pub enum Target {
+    /// 8-bit levels, 0 to 255, that stand for `level / 255`. Of type U8 the CPU reads them as they are.
+    Levels(Tensor<4, Int>),
+    /// The values themselves.
+    Values(Tensor<4>),
+}
+
+impl From<Tensor<4, Int>> for Target {
+    fn from(levels: Tensor<4, Int>) -> Self {
+        Self::Levels(levels)
+    }
+}
+
+impl From<Tensor<4>> for Target {
+    fn from(values: Tensor<4>) -> Self {
+        Self::Values(values)
+    }
+}
+
+/// What [`photometric`] measures.
+#[derive(Debug, Clone)]
+pub struct Photometric {
+    /// Mean absolute difference, `[1]`.
+    pub l1: Tensor<1>,
+    /// Mean structural similarity, `[1]`.
+    pub ssim: Tensor<1>,
+}
+
+/// Mean absolute difference and mean structural similarity (Wang et al. 2004, eq. 13) of images `[B, H, W, E]` and a
+/// target `[B, H, W, D]`, over the first D of the E channels: what [`rasterize`](crate::rasterize) returns packed needs
+/// no cutting. The similarity, that of [`ssim_map`](crate::ssim_map), is the mean over channels and over the pixels whose
+/// window lies inside of the image, as scikit-image, torchmetrics and gsplat have it; in an image smaller than the
+/// window every pixel counts.
+///
+/// Differentiable in the images; other channels than the first D have a gradient of zero. The target is a constant.
+///
+/// # Errors
+/// When shapes, types or devices do not fit, the target is tracked by autodiff, or the window's length is even or it is
+/// not symmetric.
+pub fn photometric(
+    rendered: Tensor<4>,
+    target: impl Into<Target>,
+    args: &SsimArgs,
+) -> Result<Photometric, OpError> {
+    let check = Checker::new("photometric", "rendered", &rendered)?;
+    check.window(&args.window)?;
+    let target = target.into();
+    let [b, h, w, e] = rendered.dims();
+    let d = match &target {
+        Target::Levels(levels) => levels.dims()[3],
+        Target::Values(values) => values.dims()[3],
+    };
+    let shape = [b, h, w, d.clamp(1, e.max(1))].map(Some);
+    let expected = "[B, H, W, D] with 1 <= D <= E";
+    let target = match target {
+        Target::Levels(levels) => {
+            check.place("target", &levels, shape, expected)?;
+            backend::Target::Levels(levels.into_dispatch())
+        }
+        Target::Values(values) if values.is_tracked() => {
+            return Err(check.argument(
+                "`target` is a constant, but autodiff tracks it; detach it, or use `ssim_map`, which is differentiable \
+                 in both images"
+                    .into(),
+            ));
+        }
+        Target::Values(values) => {
+            check.tensor("target", &values, shape, expected)?;
+            backend::Target::Values(values.into_dispatch())
+        }
+    };
+    let means = <Dispatch as SplatOps>::photometric(rendered.into_dispatch(), target, args.clone());
+    let means = Tensor::<1>::from_dispatch(means);
+    Ok(Photometric {
+        l1: means.clone().narrow(0, 0, 1),
+        ssim: means.narrow(0, 1, 1),
+    })
+}

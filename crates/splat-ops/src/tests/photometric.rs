@@ -1,0 +1,201 @@
+//! The photometric loss against the same composed of tensors, value and gradient.
+
+use burn::tensor::{DType, Device, Int, Tensor, TensorData};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg32;
+
+use super::devices;
+use crate::{Photometric, SsimArgs, Target, photometric, ssim_map};
+
+/// B, H, W, D, E: one band and one strip, odd sizes, several of both, and sizes smaller than the window.
+const SHAPES: [[usize; 5]; 8] = [
+    [1, 24, 32, 3, 4],
+    [2, 61, 37, 3, 3],
+    [2, 53, 29, 2, 5],
+    [1, 110, 530, 1, 2],
+    [1, 11, 11, 1, 1],
+    [2, 7, 9, 3, 4],
+    [1, 60, 5, 3, 4],
+    [1, 1, 1, 3, 4],
+];
+/// Of L1 and SSIM in the loss.
+const WEIGHTS: [f64; 2] = [0.7, -1.3];
+
+fn args() -> SsimArgs {
+    let weights: Vec<f64> = (-5..=5).map(|i| (-f64::from(i * i) / 4.5).exp()).collect();
+    let total: f64 = weights.iter().sum();
+    SsimArgs {
+        window: weights.iter().map(|weight| weight / total).collect(),
+        c1: 1e-4,
+        c2: 9e-4,
+    }
+}
+
+/// Pictures that have much in common, and a fifth of their values.
+struct Pair {
+    rendered: TensorData,
+    levels: TensorData,
+    values: TensorData,
+}
+
+fn pair([b, h, w, d, e]: [usize; 5]) -> Pair {
+    let mut rng = Pcg32::seed_from_u64(70);
+    let levels: Vec<u8> = (0..b * h * w * d).map(|_| rng.random()).collect();
+    let values: Vec<f32> = levels
+        .iter()
+        .map(|level| f32::from(*level) / 255.0)
+        .collect();
+    let mut rendered = Vec::new();
+    for pixel in values.chunks(d) {
+        rendered.extend((0..e).map(|channel| {
+            let value = pixel.get(channel).copied().unwrap_or(0.5);
+            if rng.random_bool(0.2) {
+                value
+            } else {
+                value + rng.random_range(-0.3f32..0.3)
+            }
+        }));
+    }
+    Pair {
+        rendered: TensorData::new(rendered, [b, h, w, e]),
+        levels: TensorData::new(levels, [b, h, w, d]),
+        values: TensorData::new(values, [b, h, w, d]),
+    }
+}
+
+/// L1, SSIM and the gradient of what was rendered.
+fn outcome(rendered: Tensor<4>, measured: Photometric) -> [Vec<f64>; 3] {
+    let Photometric { l1, ssim } = measured;
+    let loss = l1.clone() * WEIGHTS[0] + ssim.clone() * WEIGHTS[1];
+    let gradient = rendered.grad(&loss.backward()).unwrap();
+    [l1, ssim]
+        .map(|value| value.try_into_vec_as::<f64>().unwrap())
+        .into_iter()
+        .chain([gradient.try_into_vec_as::<f64>().unwrap()])
+        .collect::<Vec<_>>()
+        .try_into()
+        .unwrap()
+}
+
+fn fused(data: TensorData, target: impl Into<Target>, at: (&Device, DType)) -> [Vec<f64>; 3] {
+    let rendered = Tensor::<4>::from_data(data, at).require_grad();
+    let measured = photometric(rendered.clone(), target, &args()).unwrap();
+    outcome(rendered, measured)
+}
+
+/// The same of slices, maps and means, in double precision.
+fn composed(pair: &Pair) -> [Vec<f64>; 3] {
+    let device = Device::flex().autodiff();
+    let at = (&device, DType::F64);
+    let rendered = Tensor::<4>::from_data(pair.rendered.clone(), at).require_grad();
+    let target = Tensor::<4>::from_data(pair.values.clone(), at);
+    let [_, h, w, d] = target.dims();
+    let image = rendered.clone().narrow(3, 0, d);
+    let mut map = ssim_map(image.clone(), target.clone(), &args()).unwrap();
+    if h >= 11 && w >= 11 {
+        map = map.narrow(1, 5, h - 10).narrow(2, 5, w - 10);
+    }
+    let measured = Photometric {
+        l1: (image - target).abs().mean(),
+        ssim: map.mean(),
+    };
+    outcome(rendered, measured)
+}
+
+fn check(case: &str, found: &[Vec<f64>; 3], expected: &[Vec<f64>; 3], limit: f64) {
+    for (name, (found, expected)) in ["l1", "ssim", "gradient"]
+        .iter()
+        .zip(found.iter().zip(expected))
+    {
+        assert_eq!(found.len(), expected.len(), "{case}: {name}");
+        let square = |values: &mut dyn Iterator<Item = f64>| values.map(|v| v * v).sum::<f64>();
+        let difference = square(&mut found.iter().zip(expected).map(|(f, e)| f - e));
+        let error = (difference / square(&mut expected.iter().copied())).sqrt();
+        assert!(error <= limit, "{case}: {name} is off by {error:e}");
+    }
+}
+
+#[test]
+fn one_sweep_gives_what_tensors_give() {
+    for shape in SHAPES {
+        let pair = pair(shape);
+        let expected = composed(&pair);
+        let device = Device::flex().autodiff();
+        let at = (&device, DType::F64);
+        let values = Tensor::<4>::from_data(pair.values.clone(), at);
+        let found = fused(pair.rendered.clone(), values, at);
+        check(&format!("double, {shape:?}"), &found, &expected, 1e-9);
+
+        for (name, device) in devices() {
+            let device = device.autodiff();
+            let at = (&device, DType::F32);
+            let values = Tensor::<4>::from_data(pair.values.clone(), at);
+            let found = fused(pair.rendered.clone(), values, at);
+            check(&format!("{name}, {shape:?}"), &found, &expected, 1e-5);
+            for dtype in [DType::U8, DType::I32] {
+                if !device.supports_dtype(dtype) {
+                    continue;
+                }
+                let levels = Tensor::<4, Int>::from_data(pair.levels.clone(), (&device, dtype));
+                let found = fused(pair.rendered.clone(), levels, at);
+                let case = format!("{name}, {dtype:?}, {shape:?}");
+                check(&case, &found, &expected, 1e-5);
+            }
+        }
+    }
+}
+
+#[test]
+fn nothing_but_the_means_is_made_where_nothing_is_tracked() {
+    let pair = pair(SHAPES[3]);
+    let expected = composed(&pair);
+    let device = Device::flex();
+    let rendered = Tensor::<4>::from_data(pair.rendered, (&device, DType::F64));
+    let target = Tensor::<4>::from_data(pair.values, (&device, DType::F64));
+    let Photometric { l1, ssim } = photometric(rendered, target, &args()).unwrap();
+    let [l1, ssim] = [l1, ssim].map(|value| value.into_scalar::<f64>());
+    assert!((l1 - expected[0][0]).abs() < 1e-12 && (ssim - expected[1][0]).abs() < 1e-12);
+}
+
+#[test]
+fn any_number_of_threads_gives_the_same_bits() {
+    let device = Device::flex().autodiff();
+    let run = |threads: usize| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads);
+        pool.build().unwrap().install(|| {
+            let pair = pair([2, 150, 300, 3, 4]);
+            let levels = Tensor::<4, Int>::from_data(pair.levels, (&device, DType::U8));
+            fused(pair.rendered, levels, (&device, DType::F32))
+        })
+    };
+    let bits = |values: [Vec<f64>; 3]| values.map(|v| v.into_iter().map(f64::to_bits).collect());
+    let one: [Vec<u64>; 3] = bits(run(1));
+    for threads in [2, 3] {
+        assert!(one == bits(run(threads)), "{threads} threads");
+    }
+}
+
+#[test]
+fn what_does_not_fit_is_refused() {
+    let device = Device::flex().autodiff();
+    let zeros = |shape: [usize; 4]| Tensor::<4>::zeros(shape, &device);
+    let measure = |target: Tensor<4>| photometric(zeros([1, 12, 13, 4]), target, &args());
+    assert!(measure(zeros([1, 12, 13, 3])).is_ok());
+    for shape in [
+        [1, 12, 13, 5],
+        [1, 12, 13, 0],
+        [1, 13, 12, 3],
+        [2, 12, 13, 3],
+    ] {
+        let error = measure(zeros(shape)).unwrap_err().to_string();
+        assert!(error.contains("1 <= D <= E"), "{error}");
+    }
+    let tracked = zeros([1, 12, 13, 3]).require_grad();
+    let error = measure(tracked).unwrap_err().to_string();
+    assert!(error.contains("ssim_map"), "{error}");
+    let even = SsimArgs {
+        window: vec![0.5; 2],
+        ..args()
+    };
+    assert!(photometric(zeros([1, 12, 13, 3]), zeros([1, 12, 13, 3]), &even).is_err());
+}
