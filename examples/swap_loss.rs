@@ -27,10 +27,10 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let settings = config.render_settings(3);
     let loss = LossTerms::new()
         .term("charbonnier", 0.8, |view, rendered| {
-            Ok(charbonnier(rendered.image() - view.image.clone()))
+            Ok(charbonnier(rendered.image() - view.image()))
         })
         .term("edges", 0.2, |view, rendered| {
-            let along = |axis| edges(rendered.image(), axis) - edges(view.image.clone(), axis);
+            let along = |axis| edges(rendered.image(), axis) - edges(view.image(), axis);
             Ok(charbonnier(along(1)) + charbonnier(along(2)))
         });
     let trained = Trainer::builder()

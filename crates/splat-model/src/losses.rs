@@ -1,7 +1,7 @@
 //! Image losses and metrics, as functions on tensors of images `[B, H, W, D]`.
 
 use burn::tensor::Tensor;
-use splat_ops::{OpError, SsimArgs, ssim_map};
+use splat_ops::{OpError, SsimArgs, photometric};
 
 /// Mean absolute difference, `[1]`.
 pub fn l1(image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
@@ -19,7 +19,7 @@ pub fn psnr(image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
     mse(image.clamp(0.0, 1.0), target.clamp(0.0, 1.0)).log() * (-10.0 / core::f64::consts::LN_10)
 }
 
-/// Settings of [`ssim`]; the defaults are those of Wang et al. 2004 for images in [0, 1].
+/// Settings of structural similarity; the defaults are those of Wang et al. 2004 for images in [0, 1].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SsimSettings {
     /// Side of the Gaussian window in pixels, odd. Default 11.
@@ -51,36 +51,30 @@ impl SsimSettings {
         let total: f64 = (0..self.window).map(weight).sum();
         (0..self.window).map(|i| weight(i) / total).collect()
     }
+
+    /// The same as the ops take it.
+    pub fn args(&self) -> SsimArgs {
+        SsimArgs {
+            window: self.weights(),
+            c1: self.k1.powi(2),
+            c2: self.k2.powi(2),
+        }
+    }
 }
 
 /// Mean structural similarity (Wang et al. 2004), `[1]`: over channels, and over the pixels whose
 /// window lies inside the image, as scikit-image, torchmetrics and gsplat have it. In an image
-/// smaller than the window every pixel counts, with zeros outside.
+/// smaller than the window every pixel counts, with zeros outside. The target is a constant; of
+/// [`ssim_map`](splat_ops::ssim_map) it is differentiable too.
 ///
 /// # Errors
-/// When the window's side is even.
+/// When the shapes differ, the target is tracked by autodiff, or the window's side is even.
 pub fn ssim(
     image: Tensor<4>,
     target: Tensor<4>,
     settings: &SsimSettings,
 ) -> Result<Tensor<1>, OpError> {
-    let args = SsimArgs {
-        window: settings.weights(),
-        c1: settings.k1.powi(2),
-        c2: settings.k2.powi(2),
-    };
-    Ok(inside(ssim_map(image, target, &args)?, settings.window).mean())
-}
-
-/// The pixels whose window lies inside the image; all of them where there is none.
-fn inside(map: Tensor<4>, window: usize) -> Tensor<4> {
-    let [_, height, width, _] = map.dims();
-    if height < window || width < window {
-        return map;
-    }
-    let radius = window / 2;
-    map.narrow(1, radius, height - 2 * radius)
-        .narrow(2, radius, width - 2 * radius)
+    Ok(photometric(image, target, &settings.args())?.ssim)
 }
 
 #[cfg(all(test, feature = "cpu"))]

@@ -11,7 +11,7 @@ use super::colmap::{Camera, Image, SparseModel};
 use super::{CaptureError, CaptureWarning, View, downscale};
 
 /// Least width and height of a photo: the window of SSIM.
-const MIN_SIDE: u32 = 11;
+pub(super) const MIN_SIDE: u32 = 11;
 
 /// Loads the photo of every image of the model. The views come in the order of the model's images.
 pub(super) fn load(

@@ -150,6 +150,33 @@ impl Capture {
 }
 
 impl View {
+    /// The view with its photo area-averaged by `factor`, as [`CaptureOptions::downscale`] has it, or by the largest power
+    /// of two below it that leaves both sides at least as long as SSIM's window.
+    pub fn downscaled(&self, factor: u32) -> Self {
+        let mut factor = factor;
+        let shorter = self.width.min(self.height);
+        while factor > 1 && shorter / factor < images::MIN_SIDE {
+            factor = if factor.is_power_of_two() {
+                factor / 2
+            } else {
+                factor.next_power_of_two() / 2
+            };
+        }
+        if factor <= 1 {
+            return self.clone();
+        }
+        let (image, width, height) =
+            downscale::area_average(&self.image, self.width, self.height, factor);
+        Self {
+            name: self.name.clone(),
+            width,
+            height,
+            intrinsics: downscale::intrinsics(self.intrinsics, factor),
+            viewmat: self.viewmat,
+            image: Arc::new(image),
+        }
+    }
+
     /// Where a world point falls in the photo, `(x, y)` in pixels, and its depth along the camera's axis. Points at
     /// depth 0 have no finite place.
     pub fn project(&self, point: [f64; 3]) -> ([f64; 2], f64) {

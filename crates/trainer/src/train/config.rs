@@ -4,6 +4,9 @@ use serde::{Deserialize, Serialize};
 use splat_model::density::AdaptiveSettings;
 use splat_model::{InitSettings, LearningRates, RenderSettings};
 
+/// More would leave no photo anything to see.
+const MOST_HALVINGS: u32 = 8;
+
 /// Settings of a training run; together with the capture and the seed they repeat it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -14,6 +17,11 @@ pub struct TrainConfig {
     pub seed: u64,
     /// Photos are area-averaged by this factor. Default 1.
     pub downscale: u32,
+    /// Training begins with photos whose sides are halved so many times, and doubles them step by step (3DGS section 7.1
+    /// has 2: a quarter, then a half). Default 0: photos are as they are from the beginning.
+    pub coarse_halvings: u32,
+    /// So many steps of a run of 30,000 until the sides are doubled. Default 250.
+    pub coarse_every: usize,
     /// One more degree of spherical harmonics every so many steps of a run of 30,000. Default 1,000.
     pub sh_degree_every: usize,
     /// Multiply opacities by what the low-pass filter took away. Default false.
@@ -37,6 +45,8 @@ impl Default for TrainConfig {
             steps: 30_000,
             seed: 0,
             downscale: 1,
+            coarse_halvings: 0,
+            coarse_every: 250,
             sh_degree_every: 1_000,
             antialias: false,
             background: None,
@@ -79,6 +89,7 @@ impl TrainConfig {
         ];
         let counts = [
             ("steps", self.steps),
+            ("coarse_every", self.coarse_every),
             ("sh_degree_every", self.sh_degree_every),
             ("density.every", self.density.every),
             ("density.reset_every", self.density.reset_every),
@@ -88,6 +99,12 @@ impl TrainConfig {
         }
         if self.downscale == 0 {
             return Some("`downscale` must be at least 1".into());
+        }
+        if self.coarse_halvings > MOST_HALVINGS {
+            return Some(format!(
+                "`coarse_halvings` must be 0 to {MOST_HALVINGS}, it is {}",
+                self.coarse_halvings
+            ));
         }
         if let Some((field, value)) = finite_positive
             .iter()

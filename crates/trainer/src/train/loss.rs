@@ -1,30 +1,72 @@
 //! What is minimised: any closure, or a list of named, weighted terms.
 
-use burn::tensor::Tensor;
+use std::cell::OnceCell;
+
+use burn::tensor::{Int, Tensor};
 use splat_model::CameraTensors;
-use splat_model::losses::{SsimSettings, l1, ssim};
-use splat_model::ops::{OpError, Rendered};
+use splat_model::losses::SsimSettings;
+use splat_model::ops::{OpError, Rendered, photometric};
+
+use super::views::values;
 
 /// A training view as a loss sees it.
 #[derive(Debug)]
 pub struct TargetView<'a> {
     /// Name of the photo.
     pub name: &'a str,
-    /// The photo, `[1, H, W, 3]` in [0, 1].
-    pub image: Tensor<4>,
     /// Its camera.
     pub camera: &'a CameraTensors,
     /// The step, from 0.
     pub step: usize,
+    levels: Tensor<4, Int>,
+    /// Made when a loss asks for it.
+    image: OnceCell<Tensor<4>>,
 }
 
-type Term = dyn Fn(&TargetView, &Rendered) -> Result<Tensor<1>, OpError> + Send;
+impl<'a> TargetView<'a> {
+    /// A view of the photo with these 8-bit levels, `[1, H, W, 3]`.
+    pub fn new(
+        name: &'a str,
+        levels: Tensor<4, Int>,
+        camera: &'a CameraTensors,
+        step: usize,
+    ) -> Self {
+        Self {
+            name,
+            camera,
+            step,
+            levels,
+            image: OnceCell::new(),
+        }
+    }
+
+    /// The photo, `[1, H, W, 3]` in [0, 1].
+    pub fn image(&self) -> Tensor<4> {
+        let make = || values(self.levels.clone());
+        self.image.get_or_init(make).clone()
+    }
+
+    /// The photo as it is stored, 8-bit levels `[1, H, W, 3]` from 0 to 255: what
+    /// [`photometric`] reads without a copy in between.
+    pub fn levels(&self) -> Tensor<4, Int> {
+        self.levels.clone()
+    }
+}
 
 /// Named, weighted terms; the loss is their weighted sum, and each is logged by its name.
 #[derive(Default)]
 pub struct LossTerms {
-    terms: Vec<(String, f64, Box<Term>)>,
+    groups: Vec<Group>,
 }
+
+/// Terms that are measured together.
+struct Group {
+    /// Names and weights.
+    terms: Vec<(String, f64)>,
+    measure: Box<Measure>,
+}
+
+type Measure = dyn Fn(&TargetView, &Rendered) -> Result<Vec<Tensor<1>>, OpError> + Send;
 
 impl LossTerms {
     /// No terms yet.
@@ -34,34 +76,43 @@ impl LossTerms {
 
     /// Adds a term: a scalar tensor `[1]`.
     pub fn term(
-        mut self,
+        self,
         name: impl Into<String>,
         weight: f64,
         term: impl Fn(&TargetView, &Rendered) -> Result<Tensor<1>, OpError> + Send + 'static,
     ) -> Self {
-        self.terms.push((name.into(), weight, Box::new(term)));
+        self.terms([(name, weight)], move |view, rendered| {
+            Ok([term(view, rendered)?])
+        })
+    }
+
+    /// Adds terms, names and weights, that one closure measures together.
+    pub fn terms<const N: usize>(
+        mut self,
+        terms: [(impl Into<String>, f64); N],
+        measure: impl Fn(&TargetView, &Rendered) -> Result<[Tensor<1>; N], OpError> + Send + 'static,
+    ) -> Self {
+        self.groups.push(Group {
+            terms: terms.map(|(name, weight)| (name.into(), weight)).into(),
+            measure: Box::new(move |view, rendered| Ok(measure(view, rendered)?.into())),
+        });
         self
     }
 
     /// The loss of 3DGS (eq. 7): `(1 - weight) L1 + weight (1 - SSIM)`.
     pub fn l1_ssim(ssim_weight: f64) -> Self {
-        Self::new()
-            .term("l1", 1.0 - ssim_weight, |view, rendered| {
-                Ok(l1(rendered.image(), view.image.clone()))
-            })
-            .term("d_ssim", ssim_weight, |view, rendered| {
-                let similarity = ssim(
-                    rendered.image(),
-                    view.image.clone(),
-                    &SsimSettings::default(),
-                )?;
-                Ok(similarity.neg() + 1.0)
-            })
+        let args = SsimSettings::default().args();
+        let terms = [("l1", 1.0 - ssim_weight), ("d_ssim", ssim_weight)];
+        Self::new().terms(terms, move |view, rendered| {
+            let measured = photometric(rendered.packed(), view.levels(), &args)?;
+            Ok([measured.l1, measured.ssim.neg() + 1.0])
+        })
     }
 
     /// Names of the terms.
     pub fn names(&self) -> impl Iterator<Item = &str> {
-        self.terms.iter().map(|(name, ..)| name.as_str())
+        let terms = self.groups.iter().flat_map(|group| &group.terms);
+        terms.map(|(name, _)| name.as_str())
     }
 
     /// The weighted sum, and the terms without their weights, detached; `None` without terms.
@@ -71,15 +122,16 @@ impl LossTerms {
         rendered: &Rendered,
     ) -> Result<Option<(Tensor<1>, Vec<Tensor<1>>)>, OpError> {
         let mut total: Option<Tensor<1>> = None;
-        let mut values = Vec::with_capacity(self.terms.len());
-        for (_, weight, term) in &self.terms {
-            let value = term(view, rendered)?;
-            values.push(value.clone().inner());
-            let weighted = value * *weight;
-            total = Some(match total {
-                Some(total) => total + weighted,
-                None => weighted,
-            });
+        let mut values = Vec::new();
+        for Group { terms, measure } in &self.groups {
+            for (value, (_, weight)) in measure(view, rendered)?.into_iter().zip(terms) {
+                values.push(value.clone().inner());
+                let weighted = value * *weight;
+                total = Some(match total {
+                    Some(total) => total + weighted,
+                    None => weighted,
+                });
+            }
         }
         Ok(total.map(|total| (total, values)))
     }

@@ -2,6 +2,7 @@
 //! (3DGS sections 5 and 7.1).
 
 mod checkpoint;
+mod coarse;
 mod config;
 mod history;
 mod loss;
@@ -251,6 +252,7 @@ impl TrainerBuilder {
             gaussians,
             state,
             unread: Vec::new(),
+            coarse: coarse::CoarseViews::default(),
         })
     }
 }
@@ -329,6 +331,7 @@ pub struct Trainer {
     gaussians: Gaussians,
     state: State,
     unread: Vec<UnreadLoss>,
+    coarse: coarse::CoarseViews,
 }
 
 impl Trainer {
@@ -424,8 +427,9 @@ impl Trainer {
     fn step(&mut self) -> Result<(), TrainError> {
         let step = self.state.step;
         let index = self.capture.split.train[self.views.at(step)];
-        let view = &self.capture.views[index];
-        let cameras = camera(view)
+        let factor = coarse::factor(&self.config, self.run, step);
+        let view = self.coarse.view(&self.capture, index, factor);
+        let cameras = camera(&view)
             .relative_to(self.gaussians.origin)
             .tensors(&self.device);
         let settings = self.config.render_settings(self.sh_degree(step));
@@ -440,12 +444,8 @@ impl Trainer {
             projected = projected.with_screen_probe(probe.clone())?;
         }
         let rendered = render_projected(&self.gaussians, &projected, &cameras, &settings)?;
-        let target = TargetView {
-            name: &view.name,
-            image: photo(view, &self.device),
-            camera: &cameras,
-            step,
-        };
+        let levels = views::levels(&view, &self.device);
+        let target = TargetView::new(&view.name, levels, &cameras, step);
         let Some((loss, terms)) = self.loss.evaluate(&target, &rendered)? else {
             return Err(TrainError::Loss("has no term"));
         };
@@ -609,18 +609,27 @@ mod tests {
     /// Interrupted after a refinement and resumed from the file, a run ends with the same scene.
     #[test]
     fn a_resumed_run_goes_on_as_if_it_had_not_stopped() {
+        // A quarter of the resolution for 60 steps, and half of it for another 60.
+        let builder = || {
+            builder().config(TrainConfig {
+                steps: 240,
+                coarse_halvings: 2,
+                coarse_every: 7_500,
+                ..TrainConfig::default()
+            })
+        };
         let whole = builder().build().unwrap().run().unwrap();
 
         let flag = Arc::new(AtomicBool::new(false));
         let raise = flag.clone();
         let first = builder()
             .interrupt(flag)
-            .on_progress(move |state| raise.store(state.step >= 130, Ordering::Relaxed))
+            .on_progress(move |state| raise.store(state.step >= 105, Ordering::Relaxed))
             .build()
             .unwrap()
             .run()
             .unwrap();
-        assert_eq!(first.steps, 130);
+        assert_eq!(first.steps, 105);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("checkpoint.safetensors");
         first.checkpoint.save(&path).unwrap();
@@ -671,7 +680,7 @@ mod tests {
     fn any_closure_is_a_loss_and_its_terms_are_logged_by_name() {
         let terms = LossTerms::new()
             .term("far", 0.5, |view, rendered| {
-                Ok((rendered.image() - view.image.clone()).abs().mean())
+                Ok((rendered.image() - view.image()).abs().mean())
             })
             .term("opaque", 0.25, |_, rendered| Ok(rendered.alpha().mean()));
         let stop = Arc::new(AtomicBool::new(false));
@@ -692,8 +701,7 @@ mod tests {
 
     #[test]
     fn a_loss_that_sees_no_picture_or_no_number_is_an_error() {
-        let constant =
-            |view: &TargetView, _: &splat_model::ops::Rendered| Ok(view.image.clone().mean());
+        let constant = |view: &TargetView, _: &splat_model::ops::Rendered| Ok(view.image().mean());
         let error = builder().loss(constant).build().unwrap().run().unwrap_err();
         assert!(matches!(error, TrainError::Loss(_)), "{error}");
 
@@ -719,7 +727,7 @@ mod tests {
         let bad = capture().train_views().nth(3).unwrap().name.clone();
         let name = bad.clone();
         let loss = move |view: &TargetView, rendered: &splat_model::ops::Rendered| {
-            let loss = (rendered.image() - view.image.clone()).abs().mean();
+            let loss = (rendered.image() - view.image()).abs().mean();
             Ok(if view.name == name {
                 loss * f64::NAN
             } else {

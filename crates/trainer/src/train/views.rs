@@ -1,6 +1,6 @@
 //! The order in which views are trained on, and their way to the device.
 
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{DType, Device, Int, Tensor, TensorData};
 use glam::{DMat4, DVec4};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -25,9 +25,22 @@ pub fn camera(view: &View) -> Camera {
 
 /// The photo of a view, `[1, H, W, 3]` in [0, 1].
 pub fn photo(view: &View, device: &Device) -> Tensor<4> {
-    let values: Vec<f32> = view.image.iter().map(|v| f32::from(*v) / 255.0).collect();
+    values(levels(view, device))
+}
+
+/// The photo of a view as it is stored, 8-bit levels `[1, H, W, 3]`: of type U8 where the device can compute with it.
+pub(super) fn levels(view: &View, device: &Device) -> Tensor<4, Int> {
+    let dtype = match device.supports_dtype(DType::U8) {
+        true => DType::U8,
+        false => DType::I32,
+    };
     let shape = [1, view.height as usize, view.width as usize, 3];
-    Tensor::from_data(TensorData::new(values, shape), device)
+    Tensor::from_data(TensorData::new(view.image.to_vec(), shape), (device, dtype))
+}
+
+/// Levels from 0 to 255 as values in [0, 1].
+pub(super) fn values(levels: Tensor<4, Int>) -> Tensor<4> {
+    levels.float() / 255.0
 }
 
 /// Which of `count` views step `step` trains on: every epoch is a permutation drawn from (seed,

@@ -1,0 +1,103 @@
+//! Coarse-to-fine training: the first steps see small photos (3DGS section 7.1).
+
+use std::collections::HashMap;
+
+use splat_model::density::RunShape;
+
+use super::TrainConfig;
+use crate::capture::{Capture, View};
+
+/// By what photos are divided at a step.
+pub(super) fn factor(config: &TrainConfig, run: RunShape, step: usize) -> u32 {
+    let stages = step / run.milestone(config.coarse_every);
+    let left = (config.coarse_halvings as usize).saturating_sub(stages);
+    1 << left
+}
+
+/// The small photos of the present stage, made when a step asks for them.
+#[derive(Default)]
+pub(super) struct CoarseViews {
+    factor: u32,
+    views: HashMap<usize, View>,
+}
+
+impl CoarseViews {
+    /// A view of the capture, divided.
+    pub(super) fn view(&mut self, capture: &Capture, index: usize, factor: u32) -> View {
+        if self.factor != factor {
+            self.factor = factor;
+            self.views = HashMap::new();
+        }
+        let whole = &capture.views[index];
+        if factor == 1 {
+            return whole.clone();
+        }
+        let make = || whole.downscaled(factor);
+        self.views.entry(index).or_insert_with(make).clone()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::capture::CaptureOptions;
+
+    #[test]
+    fn resolution_doubles_at_every_milestone() {
+        let factors = |steps: usize, at: [usize; 6]| {
+            let config = TrainConfig {
+                steps,
+                coarse_halvings: 2,
+                ..TrainConfig::default()
+            };
+            let run = RunShape {
+                steps,
+                scene_scale: 1.0,
+                seed: 0,
+            };
+            at.map(|step| factor(&config, run, step))
+        };
+        let expected = [4, 4, 2, 2, 1, 1];
+        assert_eq!(factors(30_000, [0, 249, 250, 499, 500, 29_999]), expected);
+        assert_eq!(factors(3_000, [0, 24, 25, 49, 50, 2_999]), expected);
+        let run = RunShape {
+            steps: 100,
+            scene_scale: 1.0,
+            seed: 0,
+        };
+        assert_eq!(factor(&TrainConfig::default(), run, 0), 1);
+    }
+
+    #[test]
+    fn a_small_view_sees_the_same_and_is_made_once() {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
+        let options = CaptureOptions { downscale: 4 };
+        let capture = Capture::load(folder.as_ref(), &options).unwrap();
+        let mut views = CoarseViews::default();
+        let small = views.view(&capture, 3, 2);
+        let whole = &capture.views[3];
+        assert_eq!(
+            [small.width, small.height],
+            [whole.width / 2, whole.height / 2]
+        );
+        assert_eq!(small.image.len(), 3 * (small.width * small.height) as usize);
+        let point = capture.points[7].position;
+        let ([x, y], depth) = whole.project(point);
+        let ([u, v], small_depth) = small.project(point);
+        assert!((2.0 * u - x).abs() < 1e-9 && (2.0 * v - y).abs() < 1e-9);
+        assert_eq!(depth, small_depth);
+
+        assert!(Arc::ptr_eq(&small.image, &views.view(&capture, 3, 2).image));
+        assert!(Arc::ptr_eq(&whole.image, &views.view(&capture, 3, 1).image));
+        assert!(!Arc::ptr_eq(
+            &small.image,
+            &views.view(&capture, 3, 2).image
+        ));
+        // No photo gets smaller than the window of SSIM.
+        let least = views.view(&capture, 3, 1 << 8);
+        let shorter = least.width.min(least.height);
+        assert!((11..22).contains(&shorter), "{shorter}");
+    }
+}
