@@ -20,7 +20,7 @@ use pictures::{Pictures, spread};
 use sweep::{Scratch, Sweep};
 
 /// Rows per unit of parallel work. Fixed, so that sums are the same on any number of threads.
-const BAND: usize = 48;
+const BAND: usize = 64;
 
 /// Means `[2]` of absolute difference and similarity.
 pub(super) fn measure<T: Real>(

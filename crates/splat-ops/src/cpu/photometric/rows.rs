@@ -7,10 +7,10 @@ use super::sweep::{FIELDS, MOMENTS};
 use crate::cpu::real::Real;
 use crate::cpu::simd::vectorized;
 
-/// Values that are summed at once.
+/// Values that are summed at once along a row.
 const LANES: usize = 16;
-
-type Lanes<T> = [T; LANES];
+/// Moments of each of two rows that are summed at once: the sums of all four have to fit a processor's registers.
+const PAIR: usize = LANES / 2;
 
 /// The length of a row in memory that holds `values`: whole blocks, and one beyond.
 pub(super) fn padded(values: usize) -> usize {
@@ -19,10 +19,63 @@ pub(super) fn padded(values: usize) -> usize {
 
 /// A block of a row.
 #[inline(always)]
-fn block<T: Real>(row: &[T], start: usize) -> Lanes<T> {
-    let mut block = [T::ZERO; LANES];
-    block.copy_from_slice(&row[start..start + LANES]);
+fn block<T: Real, const L: usize>(row: &[T], start: usize) -> [T; L] {
+    let mut block = [T::ZERO; L];
+    block.copy_from_slice(&row[start..start + L]);
     block
+}
+
+/// `sums += weight values`.
+#[inline(always)]
+fn add<T: Real, const FMA: bool, const L: usize, const N: usize>(
+    sums: &mut [[T; L]; N],
+    weight: T,
+    values: &[[T; L]; N],
+) {
+    for n in 0..N {
+        for i in 0..L {
+            sums[n][i] = T::multiply_add::<FMA>(weight, values[n][i], sums[n][i]);
+        }
+    }
+}
+
+/// Two rows of N values, one below the other, blurred down the columns: `rows` are those under the window of either, in
+/// which `values` finds a block. Two at once, as there is less to compute than to fetch.
+#[inline(always)]
+fn blur_down<T: Real, Row, const FMA: bool, const L: usize, const N: usize>(
+    rows: &[Row],
+    window: &[T],
+    out: &mut [[&mut [T]; N]; 2],
+    values: impl Fn(&Row, usize) -> [[T; L]; N],
+) {
+    let last = window.len() - 1;
+    let [upper, lower] = out;
+    for start in (0..upper[0].len()).step_by(L) {
+        let [mut above, mut below] = [[[T::ZERO; L]; N]; 2];
+        add::<T, FMA, L, N>(&mut above, window[0], &values(&rows[0], start));
+        for (row, weights) in rows[1..].iter().zip(window.windows(2)) {
+            let values = values(row, start);
+            add::<T, FMA, L, N>(&mut above, weights[1], &values);
+            add::<T, FMA, L, N>(&mut below, weights[0], &values);
+        }
+        add::<T, FMA, L, N>(&mut below, window[last], &values(&rows[last + 1], start));
+        for n in 0..N {
+            upper[n][start..start + L].copy_from_slice(&above[n]);
+            lower[n][start..start + L].copy_from_slice(&below[n]);
+        }
+    }
+}
+
+/// x, y, x^2 + y^2 and xy of a block.
+#[inline(always)]
+fn moments<T: Real, const FMA: bool>([x, y]: &[&[T]; 2], start: usize) -> [[T; PAIR]; MOMENTS] {
+    let (x, y) = (block(x, start), block(y, start));
+    let [mut squares, mut products] = [[T::ZERO; PAIR]; 2];
+    for i in 0..PAIR {
+        squares[i] = T::multiply_add::<FMA>(x[i], x[i], y[i] * y[i]);
+        products[i] = x[i] * y[i];
+    }
+    [x, y, squares, products]
 }
 
 /// A block of N rows, each the weighted sum of its values at `start`, `start + step` and so on.
@@ -32,15 +85,11 @@ fn blur_along<T: Real, const FMA: bool, const N: usize>(
     start: usize,
     step: usize,
     window: &[T],
-) -> [Lanes<T>; N] {
+) -> [[T; LANES]; N] {
     let mut sums = [[T::ZERO; LANES]; N];
     for (k, weight) in window.iter().enumerate() {
-        for n in 0..N {
-            let values = block(rows[n], start + k * step);
-            for i in 0..LANES {
-                sums[n][i] = T::multiply_add::<FMA>(*weight, values[i], sums[n][i]);
-            }
-        }
+        let values = rows.map(|row| block(row, start + k * step));
+        add::<T, FMA, LANES, N>(&mut sums, *weight, &values);
     }
     sums
 }
@@ -58,10 +107,14 @@ vectorized! {
     /// The sum of `|x - y|`, in double precision.
     pub(super) fn sum_of_differences<T: Real, const FMA: bool>(x: &[T], y: &[T]) -> f64 {
         let mut sums = [0.0; LANES];
-        for (x, y) in x.chunks(LANES).zip(y.chunks(LANES)) {
-            for ((sum, x), y) in sums.iter_mut().zip(x).zip(y) {
-                *sum += (*x - *y).abs().wide();
+        let ((x, last_x), (y, last_y)) = (x.as_chunks::<LANES>(), y.as_chunks::<LANES>());
+        for (x, y) in x.iter().zip(y) {
+            for i in 0..LANES {
+                sums[i] += (x[i] - y[i]).abs().wide();
             }
+        }
+        for ((sum, x), y) in sums.iter_mut().zip(last_x).zip(last_y) {
+            *sum += (*x - *y).abs().wide();
         }
         sums.iter().sum()
     }
@@ -71,44 +124,48 @@ vectorized! {
     /// The sum, in double precision.
     pub(super) fn sum<T: Real, const FMA: bool>(values: &[T]) -> f64 {
         let mut sums = [0.0; LANES];
-        for values in values.chunks(LANES) {
-            for (sum, value) in sums.iter_mut().zip(values) {
-                *sum += value.wide();
+        let (values, last) = values.as_chunks::<LANES>();
+        for values in values {
+            for i in 0..LANES {
+                sums[i] += values[i].wide();
             }
+        }
+        for (sum, value) in sums.iter_mut().zip(last) {
+            *sum += value.wide();
         }
         sums.iter().sum()
     }
 }
 
 vectorized! {
-    /// x, y, x^2 + y^2 and xy blurred down the columns: `rows` are those under the window.
+    /// Two rows of moments blurred down the columns, from the rows of x and y under the window of either.
     pub(super) fn moments_down<T: Real, const FMA: bool>(
         rows: &[[&[T]; 2]],
         window: &[T],
-        out: &mut [&mut [T]; MOMENTS],
+        out: &mut [[&mut [T]; MOMENTS]; 2],
     ) {
-        for start in (0..out[0].len()).step_by(LANES) {
-            let mut sums = [[T::ZERO; LANES]; MOMENTS];
-            for ([x, y], weight) in rows.iter().zip(window) {
-                let (x, y) = (block(x, start), block(y, start));
-                for i in 0..LANES {
-                    let squares = T::multiply_add::<FMA>(x[i], x[i], y[i] * y[i]);
-                    let values = [x[i], y[i], squares, x[i] * y[i]];
-                    for n in 0..MOMENTS {
-                        sums[n][i] = T::multiply_add::<FMA>(*weight, values[n], sums[n][i]);
-                    }
-                }
-            }
-            for n in 0..MOMENTS {
-                out[n][start..start + LANES].copy_from_slice(&sums[n]);
-            }
+        blur_down::<T, _, FMA, PAIR, MOMENTS>(rows, window, out, moments::<T, FMA>);
+    }
+}
+
+vectorized! {
+    /// Two rows of fields blurred down the columns, from those under the window of either.
+    pub(super) fn fields_down<T: Real, const FMA: bool>(
+        rows: &[[&[T]; FIELDS]],
+        window: &[T],
+        out: &mut [[&mut [T]; FIELDS]; 2],
+    ) {
+        let [upper, lower] = out;
+        for n in 0..FIELDS {
+            let out = &mut [[&mut *upper[n]], [&mut *lower[n]]];
+            blur_down::<T, _, FMA, LANES, 1>(rows, window, out, |fields, start| [block(fields[n], start)]);
         }
     }
 }
 
 vectorized! {
     /// The fields and the similarity at `range`, from rows of moments that are blurred down the columns, by blurring
-    /// them along the row too. After the range the fields are zero.
+    /// them along the row too. Beside the range the fields are zero.
     pub(super) fn fields_along<T: Real, const FMA: bool>(
         moments: [&[T]; MOMENTS],
         range: Range<usize>,
@@ -144,31 +201,8 @@ vectorized! {
             similarity[start..start + LANES].copy_from_slice(&similarities);
         }
         for out in out {
-            out[range.end..range.end + LANES].fill(T::ZERO);
-        }
-    }
-}
-
-vectorized! {
-    /// The fields blurred down the columns: `rows` are those under the window.
-    pub(super) fn fields_down<T: Real, const FMA: bool>(
-        rows: &[[&[T]; FIELDS]],
-        window: &[T],
-        out: &mut [&mut [T]; FIELDS],
-    ) {
-        for start in (0..out[0].len()).step_by(LANES) {
-            let mut sums = [[T::ZERO; LANES]; FIELDS];
-            for (fields, weight) in rows.iter().zip(window) {
-                for n in 0..FIELDS {
-                    let values = block(fields[n], start);
-                    for i in 0..LANES {
-                        sums[n][i] = T::multiply_add::<FMA>(*weight, values[i], sums[n][i]);
-                    }
-                }
-            }
-            for n in 0..FIELDS {
-                out[n][start..start + LANES].copy_from_slice(&sums[n]);
-            }
+            out[..range.start].fill(T::ZERO);
+            out[range.end..].fill(T::ZERO);
         }
     }
 }
@@ -187,7 +221,7 @@ vectorized! {
         let reach = window.len() / 2 * step;
         for start in range.step_by(LANES) {
             let [f0, f1, f2] = blur_along::<T, FMA, FIELDS>(&fields, start - reach, step, window);
-            let (x, y) = (block(pictures[0], start), block(pictures[1], start));
+            let [x, y] = pictures.map(|row| block::<T, LANES>(row, start));
             let out = &mut out[start..start + LANES];
             for i in 0..LANES {
                 out[i] = scale * (f0[i] + x[i] * f1[i] + y[i] * f2[i]);

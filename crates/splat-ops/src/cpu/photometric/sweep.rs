@@ -9,14 +9,15 @@
 //! the fields, are zero.
 //!
 //! A band of rows is one unit of parallel work; it goes down a strip of columns at a time. What the window reaches over
-//! is kept in rings, as many rows as the window has: of the pictures, and of the fields. A step makes one row of fields,
-//! a radius above the last row of the pictures, and with it one row of the gradient, a radius higher. What the window
-//! reaches over beyond a band or a strip is computed by both neighbours.
+//! is kept in rings: rows of the pictures, and rows of fields. A step takes in two rows of the pictures, makes two of fields,
+//! a radius higher, and with these two of the gradient, a radius higher again. What the window reaches over beyond a band
+//! or a strip is computed by both neighbours.
 
 use core::ops::Range;
 
 use super::pictures::{Pictures, Rows};
 use super::rows;
+use crate::cpu::buffer::overwritten;
 use crate::cpu::real::Real;
 use crate::ssim::{SsimArgs, counted};
 
@@ -73,26 +74,33 @@ impl<'a, T: Real> Sweep<'a, T> {
         for index in 0..strips {
             let columns = index * width / strips..(index + 1) * width / strips;
             let strip = Strip::new(self, image, columns.clone());
-            scratch.clear(self.window.len(), strip.length);
-            for row in rows.start - reach - radius..rows.end + reach + radius {
-                let difference = strip.load(row, scratch);
+            scratch.reserve(strip.ring(), strip.length);
+            let mut count = |sum: usize, row: isize, value: f64| {
                 if rows.contains(&row) {
-                    sums[0] += difference;
+                    sums[sum] += value;
+                }
+            };
+            for row in (rows.start - reach - radius..rows.end + reach + radius).step_by(2) {
+                for row in [row, row + 1] {
+                    count(0, row, strip.load(row, scratch));
                 }
                 // From here on all rows under the window are there.
                 let row = row - radius;
                 if row < rows.start - reach {
                     continue;
                 }
-                let similarity = strip.fields(row, scratch);
-                if rows.contains(&row) {
-                    sums[1] += similarity;
-                }
+                let [upper, lower] = strip.fields(row, scratch);
+                count(1, row, upper);
+                count(1, row + 1, lower);
                 let row = row - radius;
                 if let Some(slope) = slope.as_deref_mut().filter(|_| row >= rows.start) {
-                    let start = (row - rows.start) as usize * width;
-                    let out = (start + columns.start) * channels..(start + columns.end) * channels;
-                    strip.slope(row, scratch, &mut slope[out]);
+                    strip.blur_fields(row, scratch);
+                    for (index, row) in (row..(row + 2).min(rows.end)).enumerate() {
+                        let start = (row - rows.start) as usize * width;
+                        let out = start + columns.start..start + columns.end;
+                        let out = &mut slope[out.start * channels..out.end * channels];
+                        strip.slope(row, index, scratch, out);
+                    }
                 }
             }
         }
@@ -106,7 +114,7 @@ pub(super) struct Scratch<T> {
     pictures: Vec<T>,
     /// Per row of the ring the fields.
     fields: Vec<T>,
-    /// Rows blurred down the columns.
+    /// Two rows blurred down the columns.
     blurred: Vec<T>,
     /// A row of results.
     results: Vec<T>,
@@ -125,16 +133,17 @@ impl<T> Default for Scratch<T> {
 }
 
 impl<T: Real> Scratch<T> {
-    /// Zeros: pixels outside of the picture, and fields of pixels that do not count, are not written.
-    fn clear(&mut self, ring: usize, length: usize) {
+    /// Memory for rings of so many rows. What it holds is written before it is read.
+    fn reserve(&mut self, ring: usize, length: usize) {
         for (memory, rows) in [
             (&mut self.pictures, 2 * ring),
             (&mut self.fields, FIELDS * ring),
-            (&mut self.blurred, MOMENTS),
+            (&mut self.blurred, 2 * MOMENTS),
             (&mut self.results, 1),
         ] {
-            memory.clear();
-            memory.resize(rows * length, T::ZERO);
+            if memory.len() < rows * length {
+                *memory = overwritten(rows * length);
+            }
         }
     }
 }
@@ -162,6 +171,11 @@ impl<'a, T: Real> Strip<'a, T> {
         }
     }
 
+    /// Rows that the windows of two rows reach over.
+    fn ring(&self) -> usize {
+        self.sweep.window.len() + 1
+    }
+
     /// The strip with a margin, as far as it lies in `within`.
     fn with_margin(&self, margin: isize, within: &Range<isize>) -> Range<isize> {
         let start = (self.columns.start - margin).max(within.start);
@@ -177,13 +191,13 @@ impl<'a, T: Real> Strip<'a, T> {
 
     /// The place of a row in a ring of N rows per row.
     fn place<const N: usize>(&self, row: isize) -> Range<usize> {
-        let slot = row.rem_euclid(self.sweep.window.len() as isize) as usize;
+        let slot = row.rem_euclid(self.ring() as isize) as usize;
         slot * N * self.length..(slot + 1) * N * self.length
     }
 
-    /// The rows of a ring under the window around `row`, from above.
+    /// The rows of a ring under the windows around `row` and the next, from above.
     fn under_window<'m, const N: usize>(&self, ring: &'m [T], row: isize) -> Vec<[&'m [T]; N]> {
-        (row - self.radius..=row + self.radius)
+        (row - self.radius..=row + self.radius + 1)
             .map(|row| split(&ring[self.place::<N>(row)], self.length))
             .collect()
     }
@@ -201,50 +215,70 @@ impl<'a, T: Real> Strip<'a, T> {
         let (x, y) = memory.split_at_mut(self.length);
         let columns = within.start as usize..within.end as usize;
         let row = self.image * height + row as usize;
-        rows.load(row, columns, &mut x[values.clone()], &mut y[values]);
+        rows.load(row, columns, &mut x[values.clone()], &mut y[values.clone()]);
+        for row in [&mut *x, &mut *y] {
+            row[..values.start].fill(T::ZERO);
+            row[values.end..].fill(T::ZERO);
+        }
         let own = self.values(&self.columns);
         rows::sum_of_differences(&x[own.clone()], &y[own])
     }
 
-    /// Makes a row of fields, zero where no pixel counts. The strip's sum of similarities.
-    fn fields(&self, row: isize, scratch: &mut Scratch<T>) -> f64 {
+    /// Makes a row of fields and the next, zero where no pixel counts. The strip's sums of similarities.
+    fn fields(&self, row: isize, scratch: &mut Scratch<T>) -> [f64; 2] {
         let [counted, columns] = &self.sweep.counted;
-        let fields = &mut scratch.fields[self.place::<FIELDS>(row)];
         let within = self.with_margin(self.radius, columns);
-        if !counted.contains(&row) || within.is_empty() {
-            fields.fill(T::ZERO);
-            return 0.0;
-        }
+        let counts = [row, row + 1].map(|row| counted.contains(&row) && !within.is_empty());
         let window = &self.sweep.window;
-        let pictures = self.under_window::<2>(&scratch.pictures, row);
-        let mut blurred = split_mut(&mut scratch.blurred, self.length);
-        rows::moments_down::<T>(&pictures, window, &mut blurred);
-        rows::fields_along(
-            blurred.map(|row| &*row),
-            self.values(&within),
-            self.sweep.rows.channels,
-            window,
-            self.sweep.constants,
-            &mut split_mut(fields, self.length),
-            &mut scratch.results,
-        );
+        if counts != [false; 2] {
+            let pictures = self.under_window::<2>(&scratch.pictures, row);
+            let mut blurred = split_twice(&mut scratch.blurred, self.length);
+            rows::moments_down::<T>(&pictures, window, &mut blurred);
+        }
         let own = self.values(&self.with_margin(0, columns));
-        rows::sum(&scratch.results[own])
+        let mut sums = [0.0; 2];
+        for index in 0..2 {
+            let fields = &mut scratch.fields[self.place::<FIELDS>(row + index as isize)];
+            if !counts[index] {
+                fields.fill(T::ZERO);
+                continue;
+            }
+            rows::fields_along(
+                split(
+                    &scratch.blurred[index * MOMENTS * self.length..],
+                    self.length,
+                ),
+                self.values(&within),
+                self.sweep.rows.channels,
+                window,
+                self.sweep.constants,
+                &mut split_mut(fields, self.length),
+                &mut scratch.results,
+            );
+            sums[index] = rows::sum(&scratch.results[own.clone()]);
+        }
+        sums
     }
 
-    /// Makes a row of the gradient.
-    fn slope(&self, row: isize, scratch: &mut Scratch<T>, out: &mut [T]) {
-        let window = &self.sweep.window;
+    /// Blurs fields down the columns, for the gradient of a row and the next.
+    fn blur_fields(&self, row: isize, scratch: &mut Scratch<T>) {
         let fields = self.under_window::<FIELDS>(&scratch.fields, row);
-        let mut blurred = split_mut(&mut scratch.blurred, self.length);
-        rows::fields_down(&fields, window, &mut blurred);
+        let mut blurred = split_twice(&mut scratch.blurred, self.length);
+        rows::fields_down::<T>(&fields, &self.sweep.window, &mut blurred);
+    }
+
+    /// Makes a row of the gradient, of the first or the second row of blurred fields.
+    fn slope(&self, row: isize, index: usize, scratch: &mut Scratch<T>, out: &mut [T]) {
         let own = self.values(&self.columns);
         rows::slope_along(
-            blurred.map(|row| &*row),
+            split(
+                &scratch.blurred[index * FIELDS * self.length..],
+                self.length,
+            ),
             split(&scratch.pictures[self.place::<2>(row)], self.length),
             own.clone(),
             self.sweep.rows.channels,
-            window,
+            &self.sweep.window,
             T::of(2.0 / self.sweep.count as f64),
             &mut scratch.results,
         );
@@ -261,4 +295,10 @@ fn split<T, const N: usize>(memory: &[T], length: usize) -> [&[T]; N] {
 fn split_mut<T, const N: usize>(memory: &mut [T], length: usize) -> [&mut [T]; N] {
     let mut rows = memory.chunks_exact_mut(length);
     core::array::from_fn(|_| rows.next().unwrap_or_default())
+}
+
+/// The first N rows, and the next N.
+fn split_twice<T, const N: usize>(memory: &mut [T], length: usize) -> [[&mut [T]; N]; 2] {
+    let (first, second) = memory.split_at_mut(N * length);
+    [first, second].map(|memory| split_mut(memory, length))
 }
