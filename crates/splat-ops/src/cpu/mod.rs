@@ -2,6 +2,9 @@
 //!
 //! Parallel over Gaussians or rows of tiles with rayon, and deterministic: whatever is summed across
 //! threads is summed in a fixed order, so the same input gives the same bits on any number of threads.
+//!
+//! Every op runs in a `tracing` span of its name, level trace, on the caller's thread: one load and a branch where nobody
+//! listens.
 
 mod adam;
 mod blur;
@@ -20,6 +23,7 @@ mod ssim;
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use burn::tensor::DType;
+use tracing::trace_span;
 
 use crate::adam::AdamStep;
 use crate::backend::SplatBackend;
@@ -47,6 +51,7 @@ impl SplatBackend for Flex {
         intrinsics: FlexTensor,
         args: &ProjectArgs,
     ) -> FlexTensor {
+        let _span = trace_span!("project").entered();
         in_precision!(
             means,
             project::forward,
@@ -65,6 +70,7 @@ impl SplatBackend for Flex {
         args: &ProjectArgs,
         wanted: [bool; 5],
     ) -> [Option<FlexTensor>; 5] {
+        let _span = trace_span!("project gradient").entered();
         in_precision!(
             means,
             project::backward,
@@ -80,6 +86,7 @@ impl SplatBackend for Flex {
         dirs: FlexTensor,
         degree: usize,
     ) -> FlexTensor {
+        let _span = trace_span!("spherical harmonics").entered();
         in_precision!(coeffs, spherical_harmonics::forward, coeffs, dirs, degree)
     }
 
@@ -90,6 +97,7 @@ impl SplatBackend for Flex {
         degree: usize,
         wanted: [bool; 2],
     ) -> [Option<FlexTensor>; 2] {
+        let _span = trace_span!("spherical harmonics gradient").entered();
         in_precision!(
             coeffs,
             spherical_harmonics::backward,
@@ -108,6 +116,7 @@ impl SplatBackend for Flex {
         background: Option<FlexTensor>,
         args: &RasterizeArgs,
     ) -> (FlexTensor, Self::RasterizeState) {
+        let _span = trace_span!("rasterize").entered();
         in_precision!(
             packed,
             rasterize::forward,
@@ -128,6 +137,7 @@ impl SplatBackend for Flex {
         args: &RasterizeArgs,
         wanted: [bool; 4],
     ) -> [Option<FlexTensor>; 4] {
+        let _span = trace_span!("rasterize gradient").entered();
         in_precision!(
             packed,
             rasterize::backward,
@@ -141,10 +151,12 @@ impl SplatBackend for Flex {
     }
 
     fn gaussian_blur(image: FlexTensor, window: &[f64]) -> FlexTensor {
+        let _span = trace_span!("blur").entered();
         in_precision!(image, blur::blur, image, window)
     }
 
     fn ssim_forward(images: [FlexTensor; 2], args: &SsimArgs) -> (FlexTensor, Vec<FlexTensor>) {
+        let _span = trace_span!("ssim").entered();
         in_precision!(images[0], ssim::forward, images, args)
     }
 
@@ -155,6 +167,7 @@ impl SplatBackend for Flex {
         args: &SsimArgs,
         wanted: [bool; 2],
     ) -> [Option<FlexTensor>; 2] {
+        let _span = trace_span!("ssim gradient").entered();
         in_precision!(
             images[0],
             ssim::backward,
@@ -167,6 +180,7 @@ impl SplatBackend for Flex {
     }
 
     fn adam(tensors: [FlexTensor; 4], step: &AdamStep) -> [FlexTensor; 3] {
+        let _span = trace_span!("adam").entered();
         in_precision!(tensors[0], adam::step, tensors, step)
     }
 }
