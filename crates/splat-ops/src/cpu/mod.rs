@@ -9,6 +9,7 @@
 mod adam;
 mod blur;
 pub(crate) mod buffer;
+mod instructions;
 mod intersect;
 mod math;
 #[cfg(test)]
@@ -24,6 +25,8 @@ use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use burn::tensor::DType;
 use tracing::trace_span;
+
+pub use instructions::InstructionSet;
 
 use crate::adam::AdamStep;
 use crate::backend::SplatBackend;
