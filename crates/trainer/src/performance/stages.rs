@@ -109,18 +109,24 @@ mod tests {
             trace_span!("outer").in_scope(|| {
                 sleep(pause);
                 for _ in 0..2 {
-                    trace_span!("inner").in_scope(|| sleep(pause));
+                    trace_span!("middle").in_scope(|| {
+                        sleep(pause);
+                        trace_span!("inner").in_scope(|| sleep(pause));
+                    });
                 }
             });
             (recording.take(), recording.take())
         });
         assert_eq!(second, []);
         let names: Vec<_> = first.iter().map(|stage| stage.name).collect();
-        assert_eq!(names, ["inner", "outer"]);
-        let [inner, outer] = first[..] else { panic!() };
+        assert_eq!(names, ["inner", "middle", "outer"]);
+        let [inner, middle, outer] = first[..] else {
+            panic!()
+        };
         assert!(inner.own >= 2 * pause && inner.own == inner.whole);
-        assert!(outer.own >= pause);
-        assert_eq!(outer.own + inner.whole, outer.whole);
+        assert!(middle.own >= 2 * pause && outer.own >= pause);
+        assert_eq!(middle.own + inner.whole, middle.whole);
+        assert_eq!(outer.own + middle.whole, outer.whole);
     }
 
     #[test]

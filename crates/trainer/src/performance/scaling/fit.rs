@@ -229,6 +229,8 @@ mod tests {
             point(100, 0.0, 100.0, 5.0),
             point(1000, 0.0, 100.0, 500.0),
             point(10, 0.0, 10_000.0, 10.0),
+            // Nearest to the first, but of another size too.
+            point(50, 0.0, 10_000.0, 50.0),
         ];
         let exponent = steepest(&points, gaussians).unwrap();
         assert!((exponent - 2.0).abs() < 1e-12, "{exponent}");
