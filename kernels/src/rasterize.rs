@@ -18,11 +18,14 @@
 
 use cubecl::prelude::*;
 
-use crate::exp::exp_neg;
+use crate::exp::exp2_neg;
 use crate::intersect::{Frames, Grid, IntersectError, TILE, TileLists, intersect};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
 use crate::math::is_finite;
 use crate::project::PACKED;
+
+/// `exp(-sigma) = 2^-t` with t this times `|z|^2`.
+const HALF_LOG2_E: f32 = 0.5 * core::f32::consts::LOG2_E;
 
 /// Channels of one launch.
 pub const MAX_CHANNELS: usize = 16;
@@ -131,7 +134,7 @@ fn sample(shape: Shape, x: f32, y: f32) -> Sample {
     let dy = y - shape.mean_y;
     let z1 = shape.w11 * dx;
     let z2 = fma(shape.w21, dx, shape.w22 * dy);
-    let falloff = exp_neg(0.5f32 * fma(z2, z2, z1 * z1));
+    let falloff = exp2_neg(HALF_LOG2_E * fma(z2, z2, z1 * z1));
     Sample {
         dx,
         dy,

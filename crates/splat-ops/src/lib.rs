@@ -40,6 +40,8 @@ mod tests;
 
 pub use adam::{AdamStep, adam_step};
 pub use blur::gaussian_blur;
+#[cfg(feature = "cpu")]
+pub use cpu::{RasterizeWork, rasterize_work};
 pub use error::{ErrorSlot, OpError};
 pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};

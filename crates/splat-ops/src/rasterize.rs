@@ -58,6 +58,51 @@ pub fn rasterize<const DC: usize, const DO: usize>(
     settings: &RasterizeSettings,
 ) -> Result<Rendered, OpError> {
     let packed = projected.packed();
+    let (colors, opacities) = per_camera(projected, colors, opacities)?;
+    let [c, _, channels] = colors.dims();
+    if let Some(background) = &background {
+        let check = Checker::new("rasterize", "projected", &packed)?;
+        check.tensor(
+            "background",
+            background,
+            [Some(c), Some(channels)],
+            "[C, D]",
+        )?;
+    }
+
+    let errors = ErrorSlot::default();
+    let packed = <Dispatch as SplatOps>::rasterize(
+        packed.into_dispatch(),
+        colors.into_dispatch(),
+        opacities.into_dispatch(),
+        match background {
+            Some(color) => Background::Color(color.into_dispatch()),
+            None => Background::None,
+        },
+        RasterizeArgs {
+            size: projected.image_size(),
+            settings: *settings,
+            errors: errors.clone(),
+        },
+    );
+    if let Some(error) = errors.error() {
+        return Err(error.clone());
+    }
+    let packed = Tensor::from_dispatch(packed);
+    Ok(Rendered {
+        image: packed.clone().narrow(3, 0, channels),
+        alpha: packed.clone().narrow(3, channels, 1),
+        packed,
+    })
+}
+
+/// Colours `[C, N, D]` and opacities `[C, N]`, checked, of what [`rasterize`] takes.
+pub(crate) fn per_camera<const DC: usize, const DO: usize>(
+    projected: &Projected,
+    colors: Tensor<DC>,
+    opacities: Tensor<DO>,
+) -> Result<(Tensor<3>, Tensor<2>), OpError> {
+    let packed = projected.packed();
     let [c, n, _] = packed.dims();
     let check = Checker::new("rasterize", "projected", &packed)?;
 
@@ -92,37 +137,5 @@ pub fn rasterize<const DC: usize, const DO: usize>(
     };
     check.tensor("colors", &colors, [None; 3], "[C, N, D]")?;
     check.tensor("opacities", &opacities, [None; 2], "[C, N]")?;
-    if let Some(background) = &background {
-        check.tensor(
-            "background",
-            background,
-            [Some(c), Some(channels)],
-            "[C, D]",
-        )?;
-    }
-
-    let errors = ErrorSlot::default();
-    let packed = <Dispatch as SplatOps>::rasterize(
-        packed.into_dispatch(),
-        colors.into_dispatch(),
-        opacities.into_dispatch(),
-        match background {
-            Some(color) => Background::Color(color.into_dispatch()),
-            None => Background::None,
-        },
-        RasterizeArgs {
-            size: projected.image_size(),
-            settings: *settings,
-            errors: errors.clone(),
-        },
-    );
-    if let Some(error) = errors.error() {
-        return Err(error.clone());
-    }
-    let packed = Tensor::from_dispatch(packed);
-    Ok(Rendered {
-        image: packed.clone().narrow(3, 0, channels),
-        alpha: packed.clone().narrow(3, channels, 1),
-        packed,
-    })
+    Ok((colors, opacities))
 }

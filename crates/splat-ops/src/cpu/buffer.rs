@@ -37,6 +37,7 @@ macro_rules! overwritten {
 overwritten!(f32, f32::NAN);
 overwritten!(f64, f64::NAN);
 overwritten!(u32, 0x7fc0_0000);
+overwritten!(i32, 0x7fc0_0000);
 
 /// A tensor whose elements lie in one row-major slice.
 pub(super) struct Buffer {

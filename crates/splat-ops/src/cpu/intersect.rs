@@ -45,89 +45,80 @@ use tests::max_pairs;
 pub(super) struct TileLists {
     /// Visible splats, front to back.
     pub(super) order: Vec<u32>,
-    /// `spans[i]..spans[i + 1]`: the emitted instances of the i-th splat of `order`.
-    pub(super) spans: Vec<u32>,
+    /// `emitted[i]..emitted[i + 1]`: the emitted instances of the i-th splat of `order`.
+    pub(super) emitted: Vec<u32>,
     /// Where each emitted instance went when they were sorted by tile.
     pub(super) position: Vec<u32>,
     /// The place in `order` of the splat of each instance, sorted by tile, front to back in each tile.
-    pub(super) ranks: Vec<u32>,
+    ranks: Vec<u32>,
     /// `tiles[t]..tiles[t + 1]`: the sorted instances of tile t, tiles in rows.
-    pub(super) tiles: Vec<u32>,
+    tiles: Vec<u32>,
 }
 
-/// The part of a splat that can pass the `alpha_min` test: the ellipse `sigma <= cut`.
+/// The part of a splat that can pass the `alpha_min` test: the ellipse `sigma <= cut`, cut being `ln(opacity / alpha_min)`,
+/// widened by a little so that rounding never drops a pixel.
 #[derive(Clone, Copy)]
 pub(super) struct Footprint<T> {
     pub(super) mean: [T; 2],
     pub(super) w11: T,
     pub(super) w21: T,
     pub(super) w22: T,
-    /// `ln(opacity / alpha_min)`, widened by a little so that rounding never drops a pixel.
-    pub(super) cut: T,
+    pub(super) opacity: T,
     /// Half size of the ellipse's bounding box.
     pub(super) half: [T; 2],
+    /// Along a row at dy the ellipse is `|dx - slope dy| <= sqrt(reach - shrink dy^2) inverse_a`.
+    pub(super) slope: T,
+    pub(super) reach: T,
+    pub(super) shrink: T,
+    pub(super) inverse_a: T,
+}
+
+/// Whether a packed splat can be seen anywhere: not culled, not too faint. NaN is not seen.
+#[inline(always)]
+fn is_visible<T: Real>(row: &[T], opacity: T, args: &RasterizeArgs) -> bool {
+    row[7] > T::ZERO && opacity >= T::of(args.settings.alpha_min) && opacity.is_finite()
 }
 
 impl<T: Real> Footprint<T> {
-    /// `None` when the splat is culled or too faint to be seen anywhere. NaN is not seen.
-    #[inline(always)]
-    pub(super) fn new(row: &[T], opacity: T, args: &RasterizeArgs) -> Option<Self> {
-        let alpha_min = T::of(args.settings.alpha_min);
-        if !(row[7] > T::ZERO && opacity >= alpha_min && opacity.is_finite()) {
-            return None;
-        }
+    /// Of a splat that [`is_visible`].
+    fn new(row: &[T], opacity: T, args: &RasterizeArgs) -> Self {
         let (w11, w21, w22) = (row[3], row[4], row[5]);
-        let cut = (opacity / alpha_min).ln();
+        let cut = (opacity / T::of(args.settings.alpha_min)).ln();
         let cut = cut + T::of(1e-4) * (cut + T::ONE);
         // L = W^-1 has l11 = 1/w11, l21 = -w21/(w11 w22), l22 = 1/w22; covariance = L L^T.
-        let radius = (cut + cut).sqrt();
-        let half_x = radius / w11;
-        let half_y = radius * (w11 * w11 + w21 * w21).sqrt() / (w11 * w22);
-        Some(Self {
+        let (radius, a) = ((cut + cut).sqrt(), w11 * w11 + w21 * w21);
+        Self {
             mean: [row[0], row[1]],
             w11,
             w21,
             w22,
-            cut,
-            half: [half_x, half_y],
-        })
+            opacity,
+            half: [radius / w11, radius * a.sqrt() / (w11 * w22)],
+            slope: -w21 * w22 / a,
+            reach: (cut + cut) * a,
+            shrink: w11 * w22 * w11 * w22,
+            inverse_a: T::ONE / a,
+        }
     }
 
-    /// Half the squared Mahalanobis distance of a point at (dx, dy) from the mean.
+    /// Left and right end of the part of the ellipse between two rows, from the mean: at one of them, or where the whole
+    /// ellipse has its end.
     #[inline(always)]
-    fn sigma(&self, dx: T, dy: T) -> T {
-        let z1 = self.w11 * dx;
-        let z2 = self.w21 * dx + self.w22 * dy;
-        T::of(0.5) * (z1 * z1 + z2 * z2)
-    }
-
-    /// Whether any point of the box [x0, x1] x [y0, y1] lies in the ellipse.
-    ///
-    /// A convex function whose minimum (the mean) lies outside a box is least on an edge that faces
-    /// that minimum; on an edge it is a parabola.
-    #[inline(always)]
-    fn touches(&self, x0: T, x1: T, y0: T, y1: T) -> bool {
-        let clamp = |v: T, low: T, high: T| v.greatest(low).least(high);
-        let (dx0, dx1) = (x0 - self.mean[0], x1 - self.mean[0]);
-        let (dy0, dy1) = (y0 - self.mean[1], y1 - self.mean[1]);
-        let inside_x = dx0 <= T::ZERO && dx1 >= T::ZERO;
-        let inside_y = dy0 <= T::ZERO && dy1 >= T::ZERO;
-        if inside_x && inside_y {
-            return true;
-        }
-        let mut least = T::of(1e30);
-        if !inside_x {
-            let dx = if dx0 > T::ZERO { dx0 } else { dx1 };
-            let dy = clamp(-self.w21 * dx / self.w22, dy0, dy1);
-            least = least.least(self.sigma(dx, dy));
-        }
-        if !inside_y {
-            let dy = if dy0 > T::ZERO { dy0 } else { dy1 };
-            let a = self.w11 * self.w11 + self.w21 * self.w21;
-            let dx = clamp(-self.w21 * self.w22 * dy / a, dx0, dx1);
-            least = least.least(self.sigma(dx, dy));
-        }
-        least <= self.cut
+    fn between(&self, dy: [T; 2]) -> [T; 2] {
+        let half_width = |dy: T| {
+            let discriminant = self.reach - self.shrink * dy * dy;
+            discriminant.greatest(T::ZERO).sqrt() * self.inverse_a
+        };
+        let (middle, half) = (dy.map(|dy| self.slope * dy), dy.map(half_width));
+        let left = (middle[0] - half[0]).least(middle[1] - half[1]);
+        let right = (middle[0] + half[0]).greatest(middle[1] + half[1]);
+        // The right end has z2 = 0, the left one lies opposite.
+        let end = -self.w21 / self.w22 * self.half[0];
+        let inside = |y: T| y >= dy[0] && y <= dy[1];
+        [
+            if inside(-end) { -self.half[0] } else { left },
+            if inside(end) { self.half[0] } else { right },
+        ]
     }
 
     /// Tiles of the bounding box: at least as many as [`tiles`](Self::tiles) emits.
@@ -146,18 +137,38 @@ impl<T: Real> Footprint<T> {
     /// Calls `emit` with every tile whose box of pixel centres the ellipse touches, row by row.
     #[inline(always)]
     fn tiles(&self, grid: Grid, mut emit: impl FnMut(u32)) {
-        let half_pixel = T::of(0.5);
-        let last = T::of((TILE - 1) as f64);
+        let (slack, last) = (T::of(1e-3), T::of((TILE - 1) as f64));
         for ty in tile_range(self.mean[1], self.half[1], grid.rows) {
-            let y0 = T::of((ty * TILE) as f64) + half_pixel;
-            for tx in tile_range(self.mean[0], self.half[0], grid.columns) {
-                let x0 = T::of((tx * TILE) as f64) + half_pixel;
-                if self.touches(x0, x0 + last, y0, y0 + last) {
-                    emit((ty * grid.columns + tx) as u32);
-                }
+            let top = T::of((ty * TILE) as f64 + 0.5) - self.mean[1];
+            let dy = [
+                top.greatest(-self.half[1]),
+                (top + last).least(self.half[1]),
+            ];
+            if dy[0] > dy[1] + slack {
+                continue;
+            }
+            let [left, right] = self.between(dy);
+            let columns = tiles_between(
+                self.mean[0] + left - slack - last,
+                self.mean[0] + right + slack,
+                grid.columns,
+            );
+            for tx in columns {
+                emit((ty * grid.columns + tx) as u32);
             }
         }
     }
+}
+
+/// The tiles whose first pixel centre is not left of `low` nor right of `high`, of `count` in a row.
+#[inline(always)]
+fn tiles_between<T: Real>(low: T, high: T, count: usize) -> core::ops::Range<usize> {
+    let index = |x: T| (x.wide() - 0.5) / TILE as f64;
+    let (low, high) = (index(low).ceil(), index(high).floor());
+    if !(high >= 0.0) {
+        return 0..0;
+    }
+    (low as usize).min(count)..(high as usize + 1).min(count)
 }
 
 /// The tiles that the interval `mean +- half` reaches, of `count` in a row or column.
@@ -189,55 +200,55 @@ impl Grid {
 }
 
 impl TileLists {
-    /// Lists for one camera: packed splats `[N, 9]`, colours `[N, D]` and opacities `[N]`. A splat with
-    /// a colour that is not finite is in no list: it would be in every pixel it touches.
+    /// Lists for one camera, and the footprints of its visible splats, front to back: packed splats `[N, 9]`, colours
+    /// `[N, D]` and opacities `[N]`. A splat with a colour that is not finite is in no list: it would be in every pixel
+    /// it touches.
     pub(super) fn new<T: Real>(
         packed: &[T],
         colors: &[T],
         opacities: &[T],
         args: &RasterizeArgs,
-    ) -> Result<Self, OpError> {
-        let channels = colors.len() / opacities.len().max(1);
+    ) -> Result<(Self, Vec<Footprint<T>>), OpError> {
+        let channels = (colors.len() / opacities.len().max(1)).max(1);
+        let row = |n: u32| &packed[n as usize * PROJECTED_WIDTH..][..PROJECTED_WIDTH];
+        let is_listed = |n: &u32| {
+            let color = &colors[*n as usize * channels..][..channels];
+            is_visible(row(*n), opacities[*n as usize], args) && color.iter().all(|c| c.is_finite())
+        };
+        let mut keys: Vec<(T::Key, u32)> = (0..opacities.len() as u32)
+            .into_par_iter()
+            .with_min_len(CHUNK)
+            .filter(is_listed)
+            .map(|n| (row(n)[2].key(), n))
+            .collect();
+        // Ties by index make the order total, so an unstable sort is deterministic.
+        keys.par_sort_unstable();
+        let order: Vec<u32> = keys.into_iter().map(|(_, n)| n).collect();
+        let footprints: Vec<Footprint<T>> = order
+            .par_iter()
+            .with_min_len(CHUNK)
+            .map(|n| Footprint::new(row(*n), opacities[*n as usize], args))
+            .collect();
+
         let limit = max_pairs();
         let grid = Grid::new(args);
-        let footprints: Vec<Option<Footprint<T>>> = packed
-            .par_chunks_exact(PROJECTED_WIDTH)
-            .zip(colors.par_chunks_exact(channels.max(1)))
-            .zip(opacities)
-            .with_min_len(CHUNK)
-            .map(|((row, color), opacity)| {
-                let footprint = Footprint::new(row, *opacity, args)?;
-                color.iter().all(|c| c.is_finite()).then_some(footprint)
-            })
-            .collect();
         // The exact count costs as much as the lists do: only where the bounding boxes are too many.
         let sum = |count: fn(&Footprint<T>, Grid) -> u64| -> u64 {
-            let counts = footprints.par_iter().with_min_len(CHUNK).flatten();
+            let counts = footprints.par_iter().with_min_len(CHUNK);
             counts.map(|footprint| count(footprint, grid)).sum()
         };
         if check_pairs(sum(Footprint::tiles_at_most), limit).is_err() {
             check_pairs(sum(Footprint::count_tiles), limit)?;
         }
 
-        let depth = |n: u32| packed[n as usize * PROJECTED_WIDTH + 2].wide();
-        let mut order: Vec<u32> = footprints
-            .iter()
-            .zip(0..)
-            .filter_map(|(footprint, n)| footprint.is_some().then_some(n))
-            .collect();
-        // Ties by index make the order total, so an unstable sort is deterministic.
-        order.par_sort_unstable_by(|a, b| depth(*a).total_cmp(&depth(*b)).then(a.cmp(b)));
-
         // Emit: per chunk of splats the tiles in order, and how many each splat has.
-        let emitted: Vec<(Vec<u32>, Vec<u32>)> = order
+        let chunks: Vec<(Vec<u32>, Vec<u32>)> = footprints
             .par_chunks(CHUNK)
             .map(|chunk| {
                 let mut tiles = Vec::with_capacity(4 * chunk.len());
-                let counts = chunk.iter().map(|n| {
+                let counts = chunk.iter().map(|footprint| {
                     let before = tiles.len();
-                    if let Some(footprint) = &footprints[*n as usize] {
-                        footprint.tiles(grid, |tile| tiles.push(tile));
-                    }
+                    footprint.tiles(grid, |tile| tiles.push(tile));
                     (tiles.len() - before) as u32
                 });
                 let counts = counts.collect();
@@ -246,12 +257,12 @@ impl TileLists {
             .collect();
 
         // Exclusive prefix sums: instances per splat, instances per tile.
-        let mut spans = Vec::with_capacity(order.len() + 1);
-        spans.push(0);
+        let mut emitted = Vec::with_capacity(order.len() + 1);
+        emitted.push(0);
         let mut tile_counts = vec![0u32; grid.columns * grid.rows];
-        for (tiles, counts) in &emitted {
+        for (tiles, counts) in &chunks {
             for count in counts {
-                spans.push(spans[spans.len() - 1] + count);
+                emitted.push(emitted[emitted.len() - 1] + count);
             }
             for tile in tiles {
                 tile_counts[*tile as usize] += 1;
@@ -269,9 +280,9 @@ impl TileLists {
         let mut position = Vec::with_capacity(total);
         let mut ranks = overwritten::<u32>(total);
         let mut owners = (0u32..)
-            .zip(spans.windows(2))
-            .flat_map(|(rank, span)| core::iter::repeat_n(rank, (span[1] - span[0]) as usize));
-        for tile in emitted.iter().flat_map(|(tiles, _)| tiles) {
+            .zip(emitted.windows(2))
+            .flat_map(|(rank, range)| core::iter::repeat_n(rank, (range[1] - range[0]) as usize));
+        for tile in chunks.iter().flat_map(|(tiles, _)| tiles) {
             let slot = &mut next[*tile as usize];
             if let Some(rank) = owners.next() {
                 ranks[*slot as usize] = rank;
@@ -279,13 +290,14 @@ impl TileLists {
             position.push(*slot);
             *slot += 1;
         }
-        Ok(Self {
+        let lists = Self {
             order,
-            spans,
+            emitted,
             position,
             ranks,
             tiles,
-        })
+        };
+        Ok((lists, footprints))
     }
 
     /// Number of (splat, tile) pairs.
@@ -293,10 +305,15 @@ impl TileLists {
         self.ranks.len()
     }
 
-    /// The places in `order` of a tile's splats, front to back, and where they begin among the sorted instances.
-    pub(super) fn tile(&self, tile: usize) -> (usize, &[u32]) {
-        let (start, end) = (self.tiles[tile] as usize, self.tiles[tile + 1] as usize);
-        (start, &self.ranks[start..end])
+    /// The places in `order` of a tile's splats, front to back.
+    pub(super) fn tile(&self, tile: usize) -> &[u32] {
+        &self.ranks[self.tiles[tile] as usize..self.tiles[tile + 1] as usize]
+    }
+
+    /// The sorted instances of a row of tiles.
+    pub(super) fn row_of_tiles(&self, ty: usize, grid: Grid) -> core::ops::Range<usize> {
+        let [first, last] = [ty, ty + 1].map(|row| self.tiles[row * grid.columns] as usize);
+        first..last
     }
 }
 
@@ -481,10 +498,11 @@ mod tests {
                 1.0,
             ]
             .map(|v: f64| v as f32);
-            let Some(footprint) = Footprint::new(&row, opacity, &args) else {
+            if !is_visible(&row, opacity, &args) {
                 assert!(opacity < 1.0 / 255.0);
                 continue;
-            };
+            }
+            let footprint = Footprint::new(&row, opacity, &args);
             let mut listed = vec![false; grid.columns * grid.rows];
             footprint.tiles(grid, |tile| listed[tile as usize] = true);
             kept += listed.iter().filter(|l| **l).count();

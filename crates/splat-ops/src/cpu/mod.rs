@@ -28,6 +28,8 @@ use tracing::trace_span;
 
 pub use instructions::InstructionSet;
 
+pub use rasterize::{RasterizeWork, rasterize_work};
+
 use crate::adam::AdamStep;
 use crate::backend::SplatBackend;
 use crate::settings::{ProjectArgs, RasterizeArgs};

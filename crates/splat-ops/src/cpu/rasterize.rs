@@ -8,14 +8,17 @@
 //! image += c alpha T;  T *= 1 - alpha
 //! ```
 //!
-//! Splats are prepared once per view, in depth order. A tile is worked on in blocks of eight pixels of
-//! a row, those only that a splat's ellipse reaches, in loops of fixed width without branches that the
-//! compiler turns into SIMD code for the processor it finds at run time.
+//! Splats are prepared once per view, in depth order. Of a tile's rows those pixels only are worked on that a splat's
+//! ellipse reaches, in blocks of eight, in loops of fixed width without branches that the compiler turns into SIMD code
+//! for the processor it finds at run time.
 
 mod blend;
+mod blocks;
 mod gradient;
 mod splat;
+mod work;
 
+use core::any::Any;
 use core::marker::PhantomData;
 use std::sync::Arc;
 
@@ -26,43 +29,80 @@ use super::buffer::{Buffer, overwritten, tensor};
 use super::intersect::{CHUNK, Grid, TILE, TileLists};
 use super::real::Real;
 use super::simd::vectorized;
+use crate::OpError;
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::RasterizeArgs;
 use blend::BlendTile;
-use gradient::{GradientTile, Upstream};
+use blocks::Blocks;
+use gradient::{GradientTile, MOMENTS, Upstream};
 use splat::Splat;
 
-/// Partial gradients of a splat before its D colours: screen mean, w11, w21, w22, opacity.
-const GEOMETRY: usize = 6;
+pub use work::{RasterizeWork, rasterize_work};
 
-/// What the forward keeps for the backward.
+/// What the forward keeps for the backward: a [`Frame`] per camera, none of an image that was not rendered.
 #[derive(Debug, Clone)]
-pub struct State {
-    /// Per camera.
-    lists: Arc<Vec<TileLists>>,
-    /// `[C, H, W]`: what is left of the light at each pixel. One minus alpha would lose its digits.
-    transmittance: FlexTensor,
-    /// `[C, H, W]`: the place, in the list of the pixel's tile, of the splat before which it stopped.
-    stop: Arc<Vec<u32>>,
-}
+pub struct State(Arc<dyn Any + Send + Sync>);
 
 impl State {
-    /// Of an image that was not rendered: no camera has a list, and no gradient anything in it.
-    fn none<T: Real>() -> Self {
-        Self {
-            lists: Arc::default(),
-            transmittance: tensor(Vec::<T>::new(), [0, 0, 0]),
-            stop: Arc::default(),
-        }
+    fn new<T: Real>(frames: Vec<Frame<T>>) -> Self {
+        Self(Arc::new(frames))
+    }
+
+    fn frames<T: Real>(&self) -> &[Frame<T>] {
+        self.0
+            .downcast_ref::<Vec<Frame<T>>>()
+            .map_or(&[], Vec::as_slice)
     }
 }
 
-/// One camera's splats, front to back, as the tiles read them.
-struct View<'a, T> {
+/// One camera's splats, front to back, and what became of its pixels.
+struct Frame<T> {
+    lists: TileLists,
+    /// By row of tiles.
+    blocks: Vec<Blocks>,
     /// By rank.
     splats: Vec<Splat<T>>,
     /// By rank, D each.
     colors: Vec<T>,
+    /// `[H, W]`: what is left of the light at each pixel. One minus alpha would lose its digits.
+    transmittance: Vec<T>,
+    /// `[H, W]`: the place, in the list of the pixel's tile, of the splat before which it stopped; `i32::MAX` where it
+    /// did not.
+    stop: Vec<i32>,
+}
+
+impl<T: Real> Frame<T> {
+    fn new(camera: &Camera<T>, args: &RasterizeArgs) -> Result<Self, OpError> {
+        let (lists, footprints) =
+            TileLists::new(camera.packed, camera.colors, camera.opacities, args)?;
+        let splats = footprints.par_iter().with_min_len(CHUNK).map(Splat::new);
+        let d = camera.channels;
+        let mut colors = overwritten::<T>(lists.order.len() * d);
+        colors
+            .par_chunks_exact_mut(d)
+            .with_min_len(CHUNK)
+            .zip(&lists.order)
+            .for_each(|(color, n)| {
+                let n = *n as usize;
+                color.copy_from_slice(&camera.colors[n * d..(n + 1) * d]);
+            });
+        let pixels = args.size.width as usize * args.size.height as usize;
+        Ok(Self {
+            splats: splats.collect(),
+            lists,
+            blocks: Vec::new(),
+            colors,
+            transmittance: overwritten::<T>(pixels),
+            stop: overwritten::<i32>(pixels),
+        })
+    }
+}
+
+/// One camera's splats as the tiles read them.
+struct View<'a, T> {
+    lists: &'a TileLists,
+    splats: &'a [Splat<T>],
+    colors: &'a [T],
     background: Option<&'a [T]>,
     channels: usize,
     width: usize,
@@ -72,33 +112,19 @@ struct View<'a, T> {
 }
 
 impl<'a, T: Real> View<'a, T> {
-    fn new(camera: &Camera<'a, T>, order: &[u32], args: &'a RasterizeArgs) -> Self {
-        let d = camera.channels;
-        let splats = order
-            .par_iter()
-            .with_min_len(CHUNK)
-            .map(|n| {
-                let n = *n as usize;
-                let row = &camera.packed[n * PROJECTED_WIDTH..(n + 1) * PROJECTED_WIDTH];
-                Splat::new(row, camera.opacities[n], args)
-            })
-            // The lists hold what has a footprint, and so has a splat.
-            .flatten_iter()
-            .collect();
-        let mut colors = overwritten::<T>(order.len() * d);
-        colors
-            .par_chunks_exact_mut(d)
-            .with_min_len(CHUNK)
-            .zip(order)
-            .for_each(|(color, n)| {
-                let n = *n as usize;
-                color.copy_from_slice(&camera.colors[n * d..(n + 1) * d]);
-            });
+    fn new(
+        lists: &'a TileLists,
+        splats: &'a [Splat<T>],
+        colors: &'a [T],
+        camera: &Camera<'a, T>,
+        args: &'a RasterizeArgs,
+    ) -> Self {
         Self {
+            lists,
             splats,
             colors,
             background: camera.background,
-            channels: d,
+            channels: camera.channels,
             width: args.size.width as usize,
             height: args.size.height as usize,
             grid: Grid::new(args),
@@ -111,12 +137,12 @@ impl<'a, T: Real> View<'a, T> {
         TILE * self.width
     }
 
-    /// (columns of a tile in the image, rows of a row of tiles in the image).
-    fn inside(&self, tx: usize, ty: usize) -> (usize, usize) {
-        (
+    /// Columns and rows of a tile that lie in the image.
+    fn inside(&self, [tx, ty]: [usize; 2]) -> [usize; 2] {
+        [
             TILE.min(self.width - tx * TILE),
             TILE.min(self.height - ty * TILE),
-        )
+        ]
     }
 }
 
@@ -124,7 +150,7 @@ impl<'a, T: Real> View<'a, T> {
 struct Slab<'a, T> {
     image: &'a mut [T],
     transmittance: &'a mut [T],
-    stop: &'a mut [u32],
+    stop: &'a mut [i32],
 }
 
 /// The inputs of one camera.
@@ -184,61 +210,78 @@ pub(super) fn forward<T: Real>(
     let [c, _, d] = inputs.dims();
     let (w, h) = (args.size.width as usize, args.size.height as usize);
     let mut image = overwritten::<T>(c * h * w * (d + 1));
-    let mut transmittance = overwritten::<T>(c * h * w);
-    let mut stop = overwritten::<u32>(c * h * w);
-    let mut lists = Vec::with_capacity(c);
+    let mut frames = Vec::with_capacity(c);
 
-    for index in 0..c {
+    for (index, image) in image.chunks_exact_mut(h * w * (d + 1)).enumerate() {
         let camera = inputs.camera::<T>(index);
-        let camera_lists =
-            match TileLists::new(camera.packed, camera.colors, camera.opacities, args) {
-                Ok(lists) => lists,
-                Err(error) => {
-                    args.errors.report(error);
-                    let black = vec![T::ZERO; image.len()];
-                    return (tensor(black, [c, h, w, d + 1]), State::none::<T>());
-                }
-            };
-        let pixels = index * h * w..(index + 1) * h * w;
-        let image = &mut image[pixels.start * (d + 1)..pixels.end * (d + 1)];
-        let view = View::new(&camera, &camera_lists.order, args);
-        image
-            .par_chunks_mut(view.slab() * (d + 1))
-            .zip(transmittance[pixels.clone()].par_chunks_mut(view.slab()))
-            .zip(stop[pixels].par_chunks_mut(view.slab()))
-            .enumerate()
-            .for_each(|(ty, ((image, transmittance), stop))| {
-                let slab = Slab {
-                    image,
-                    transmittance,
-                    stop,
-                };
-                blend_row_of_tiles(&view, &camera_lists, ty, slab);
-            });
-        lists.push(camera_lists);
+        match Frame::new(&camera, args) {
+            Ok(mut frame) => {
+                blend(&mut frame, &camera, args, image);
+                frames.push(frame);
+            }
+            Err(error) => {
+                args.errors.report(error);
+                frames.clear();
+                break;
+            }
+        }
     }
-    let state = State {
-        lists: Arc::new(lists),
-        transmittance: tensor(transmittance, [c, h, w]),
-        stop: Arc::new(stop),
-    };
-    (tensor(image, [c, h, w, d + 1]), state)
+    if frames.len() < c {
+        image.fill(T::ZERO);
+    }
+    (tensor(image, [c, h, w, d + 1]), State::new(frames))
+}
+
+/// Renders one camera's image.
+fn blend<T: Real>(frame: &mut Frame<T>, camera: &Camera<T>, args: &RasterizeArgs, image: &mut [T]) {
+    let view = View::new(&frame.lists, &frame.splats, &frame.colors, camera, args);
+    let slab = view.slab();
+    frame.blocks = image
+        .par_chunks_mut(slab * (view.channels + 1))
+        .zip(frame.transmittance.par_chunks_mut(slab))
+        .zip(frame.stop.par_chunks_mut(slab))
+        .enumerate()
+        .map(|(ty, ((image, transmittance), stop))| {
+            let slab = Slab {
+                image,
+                transmittance,
+                stop,
+            };
+            blend_row_of_tiles(&view, ty, slab)
+        })
+        .collect();
 }
 
 vectorized! {
-    /// Renders one row of tiles into its part of the image.
+    /// Renders one row of tiles into its part of the image; returns the blocks that it worked on.
     fn blend_row_of_tiles<T: Real, const FMA: bool>(
         view: &View<T>,
-        lists: &TileLists,
         ty: usize,
         slab: Slab<T>,
-    ) {
-        let mut slab = slab;
-        for tx in 0..view.grid.columns {
-            let (_, ranks) = lists.tile(ty * view.grid.columns + tx);
-            BlendTile::blend::<FMA>(view, ranks, tx, ty).store(view, tx, ty, &mut slab);
+    ) -> Blocks {
+        // With a number of channels that the compiler knows, their loops are unrolled.
+        match view.channels {
+            3 => blend_row::<T, FMA>(view, ty, slab, 3),
+            channels => blend_row::<T, FMA>(view, ty, slab, channels),
         }
     }
+}
+
+#[inline(always)]
+fn blend_row<T: Real, const FMA: bool>(
+    view: &View<T>,
+    ty: usize,
+    mut slab: Slab<T>,
+    channels: usize,
+) -> Blocks {
+    let mut tile = BlendTile::new(channels);
+    let mut blocks = Blocks::new(view.lists.row_of_tiles(ty, view.grid).len());
+    for tx in 0..view.grid.columns {
+        let ranks = view.lists.tile(ty * view.grid.columns + tx);
+        tile.blend::<FMA>(view, ranks, [tx, ty], channels, &mut blocks, &mut ());
+        tile.store(view, [tx, ty], &mut slab, channels);
+    }
+    blocks
 }
 
 pub(super) fn backward<T: Real>(
@@ -252,86 +295,93 @@ pub(super) fn backward<T: Real>(
 ) -> [Option<FlexTensor>; 4] {
     let inputs = Inputs::new(inputs, background);
     let [c, n, d] = inputs.dims();
-    let (w, h) = (args.size.width as usize, args.size.height as usize);
-    let (grad, transmittance) = (Buffer::new(grad_output), Buffer::new(state.transmittance));
-    let width = GEOMETRY + d;
-    let mut sums = vec![T::ZERO; c * n * width];
-    let mut grad_background = vec![T::ZERO; c * d];
-
-    for (index, lists) in state.lists.iter().enumerate() {
-        let view = View::new(&inputs.camera::<T>(index), &lists.order, args);
-        let pixels = index * h * w..(index + 1) * h * w;
+    let pixels = args.size.width as usize * args.size.height as usize * (d + 1);
+    let grad = Buffer::new(grad_output);
+    let grad = grad.slice::<T>();
+    let mut out = Gradients {
+        packed: vec![T::ZERO; c * n * PROJECTED_WIDTH],
+        colors: vec![T::ZERO; c * n * d],
+        opacities: vec![T::ZERO; c * n],
+        background: vec![T::ZERO; c * d],
+    };
+    for (index, frame) in state.frames::<T>().iter().enumerate() {
+        let view = View::new(
+            &frame.lists,
+            &frame.splats,
+            &frame.colors,
+            &inputs.camera(index),
+            args,
+        );
         let upstream = Upstream {
-            grad: &grad.slice::<T>()[pixels.start * (d + 1)..pixels.end * (d + 1)],
-            transmittance: &transmittance.slice::<T>()[pixels.clone()],
-            stop: &state.stop[pixels],
+            grad: &grad[index * pixels..(index + 1) * pixels],
+            transmittance: &frame.transmittance,
+            stop: &frame.stop,
         };
         // Every (tile, splat) pair writes its own row; each splat then sums its rows in order.
-        let mut partials = vec![T::ZERO; lists.instances() * width];
-        let slabs = split_by_tile_row(&mut partials, lists, view.grid, width);
+        let width = MOMENTS + d;
+        let mut partials = vec![T::ZERO; frame.lists.instances() * width];
+        let slabs = split_by_tile_row(&mut partials, &frame.lists, view.grid, width);
         let backgrounds: Vec<Vec<T>> = slabs
             .into_par_iter()
             .enumerate()
-            .map(|(ty, partials)| row_of_tiles_backward(&view, lists, &upstream, ty, partials))
+            .map(|(ty, partials)| {
+                row_of_tiles_backward(&view, &frame.blocks[ty], &upstream, ty, partials)
+            })
             .collect();
         for row in backgrounds {
-            for (sum, value) in grad_background[index * d..].iter_mut().zip(row) {
+            for (sum, value) in out.background[index * d..].iter_mut().zip(row) {
                 *sum += value;
             }
         }
-        reduce(
-            &partials,
-            lists,
-            &mut sums[index * n * width..(index + 1) * n * width],
-            width,
-        );
+        out.reduce(index * n, n, &partials, frame, d);
     }
-
-    let column = |from: usize, length: usize| -> Vec<T> {
-        sums.chunks_exact(width)
-            .flat_map(|row| &row[from..from + length])
-            .copied()
-            .collect()
-    };
     [
-        wanted[0].then(|| {
-            let mut packed = vec![T::ZERO; c * n * PROJECTED_WIDTH];
-            for (row, sum) in packed
-                .chunks_exact_mut(PROJECTED_WIDTH)
-                .zip(sums.chunks_exact(width))
-            {
-                row[..2].copy_from_slice(&sum[..2]);
-                row[3..6].copy_from_slice(&sum[2..5]);
-            }
-            tensor(packed, [c, n, PROJECTED_WIDTH])
-        }),
-        wanted[1].then(|| tensor(column(GEOMETRY, d), [c, n, d])),
-        wanted[2].then(|| tensor(column(GEOMETRY - 1, 1), [c, n])),
-        wanted[3].then(|| tensor(grad_background, [c, d])),
+        wanted[0].then(|| tensor(out.packed, [c, n, PROJECTED_WIDTH])),
+        wanted[1].then(|| tensor(out.colors, [c, n, d])),
+        wanted[2].then(|| tensor(out.opacities, [c, n])),
+        wanted[3].then(|| tensor(out.background, [c, d])),
     ]
 }
 
 vectorized! {
-    /// Writes the partial gradients of one row of tiles; returns its share of the background's.
+    /// Writes the sums of one row of tiles; returns its share of the background's gradient.
     fn row_of_tiles_backward<T: Real, const FMA: bool>(
         view: &View<T>,
-        lists: &TileLists,
+        blocks: &Blocks,
         upstream: &Upstream<T>,
         ty: usize,
         partials: &mut [T],
     ) -> Vec<T> {
-        let width = GEOMETRY + view.channels;
-        let mut partials = partials;
-        let mut background = vec![T::ZERO; view.channels];
-        for tx in 0..view.grid.columns {
-            let (_, ranks) = lists.tile(ty * view.grid.columns + tx);
-            let (tile, rest) = core::mem::take(&mut partials).split_at_mut(ranks.len() * width);
-            partials = rest;
-            GradientTile::load(view, upstream, tx, ty, &mut background)
-                .walk::<FMA>(view, ranks, tx, ty, tile);
+        match view.channels {
+            3 => row_backward::<T, FMA>(view, blocks, upstream, ty, partials, 3),
+            channels => row_backward::<T, FMA>(view, blocks, upstream, ty, partials, channels),
         }
-        background
     }
+}
+
+#[inline(always)]
+fn row_backward<T: Real, const FMA: bool>(
+    view: &View<T>,
+    blocks: &Blocks,
+    upstream: &Upstream<T>,
+    ty: usize,
+    mut partials: &mut [T],
+    channels: usize,
+) -> Vec<T> {
+    let mut background = vec![T::ZERO; channels];
+    let mut tile = GradientTile::new(channels);
+    let (mut first, mut end) = (0, 0);
+    for tx in 0..view.grid.columns {
+        let ranks = view.lists.tile(ty * view.grid.columns + tx);
+        let length = ranks.len() * (MOMENTS + channels);
+        let (sums, rest) = core::mem::take(&mut partials).split_at_mut(length);
+        partials = rest;
+        tile.load(view, upstream, [tx, ty], channels, &mut background);
+        end += blocks.count(first..first + ranks.len());
+        tile.walk::<FMA>(view, ranks, [tx, ty], channels, (blocks, first, end), sums);
+        first += ranks.len();
+    }
+    background
 }
 
 /// The part of `partials` that belongs to each row of tiles.
@@ -343,9 +393,7 @@ fn split_by_tile_row<'a, T>(
 ) -> Vec<&'a mut [T]> {
     (0..grid.rows)
         .map(|ty| {
-            let (start, _) = lists.tile(ty * grid.columns);
-            let (last, splats) = lists.tile(ty * grid.columns + grid.columns - 1);
-            let length = (last + splats.len() - start) * width;
+            let length = lists.row_of_tiles(ty, grid).len() * width;
             let (slab, rest) = core::mem::take(&mut partials).split_at_mut(length);
             partials = rest;
             slab
@@ -353,24 +401,47 @@ fn split_by_tile_row<'a, T>(
         .collect()
 }
 
-/// Sums the partial gradients of each splat over its tiles, in the order they were emitted.
-fn reduce<T: Real>(partials: &[T], lists: &TileLists, sums: &mut [T], width: usize) {
-    const HIDDEN: u32 = u32::MAX;
-    let mut rank = vec![HIDDEN; sums.len() / width];
-    for (i, n) in lists.order.iter().enumerate() {
-        rank[*n as usize] = i as u32;
-    }
-    sums.par_chunks_mut(width)
-        .with_min_len(256)
-        .zip(&rank)
-        .filter(|(_, rank)| **rank != HIDDEN)
-        .for_each(|(sum, rank)| {
-            let i = *rank as usize;
-            for position in &lists.position[lists.spans[i] as usize..lists.spans[i + 1] as usize] {
-                let row = &partials[*position as usize * width..][..width];
-                for (sum, value) in sum.iter_mut().zip(row) {
-                    *sum += *value;
+/// Gradients of the four inputs.
+struct Gradients<T> {
+    packed: Vec<T>,
+    colors: Vec<T>,
+    opacities: Vec<T>,
+    background: Vec<T>,
+}
+
+impl<T: Real> Gradients<T> {
+    /// Sums what each splat of a camera has in its tiles, in the order they were emitted, and turns that into gradients.
+    /// The camera's rows begin at `first`.
+    fn reduce(&mut self, first: usize, n: usize, partials: &[T], frame: &Frame<T>, d: usize) {
+        const HIDDEN: u32 = u32::MAX;
+        let Frame { lists, splats, .. } = frame;
+        let mut ranks = vec![HIDDEN; n];
+        for (rank, n) in (0..).zip(&lists.order) {
+            ranks[*n as usize] = rank;
+        }
+        let rows = first..first + n;
+        self.packed[rows.start * PROJECTED_WIDTH..rows.end * PROJECTED_WIDTH]
+            .par_chunks_exact_mut(PROJECTED_WIDTH)
+            .zip(self.colors[rows.start * d..rows.end * d].par_chunks_exact_mut(d))
+            .zip(&mut self.opacities[rows])
+            .zip(&ranks)
+            .with_min_len(CHUNK)
+            .filter(|(_, rank)| **rank != HIDDEN)
+            .for_each(|(((packed, color), opacity), rank)| {
+                let rank = *rank as usize;
+                let mut moments = [T::ZERO; MOMENTS];
+                let own = lists.emitted[rank] as usize..lists.emitted[rank + 1] as usize;
+                for position in &lists.position[own] {
+                    let row = &partials[*position as usize * (MOMENTS + d)..][..MOMENTS + d];
+                    let sums = moments.iter_mut().chain(color.iter_mut());
+                    for (sum, value) in sums.zip(row) {
+                        *sum += *value;
+                    }
                 }
-            }
-        });
+                let (geometry, of_opacity) = splats[rank].gradients(moments);
+                packed[..2].copy_from_slice(&geometry[..2]);
+                packed[3..6].copy_from_slice(&geometry[2..]);
+                *opacity = of_opacity;
+            });
+    }
 }

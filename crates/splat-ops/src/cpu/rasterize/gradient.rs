@@ -2,271 +2,220 @@
 //!
 //! ```text
 //! d alpha = T (c . grad) - behind / (1 - alpha)
-//! d o = exp(-sigma) d alpha,  d sigma = -raw d alpha     (both 0 at the cap)
-//! d z = z d sigma;  d w11 = dz1 dx;  d w21 = dz2 dx;  d w22 = dz2 dy
-//! d mean = -(w11 dz1 + w21 dz2, w22 dz2)
+//! g = d sigma = -raw d alpha     (0 at the cap)
+//! ```
+//!
+//! Everything that a splat's shape needs is six sums over its pixels, of g times 1, z1, z2, z1^2, z1 z2 and z2^2. z is of
+//! the order of one wherever the splat is seen, so nothing cancels, however thin or far away it is. With dx = z1 / w11
+//! and dy = (z2 - w21 dx) / w22:
+//!
+//! ```text
+//! d o   = -sum(g) / o                 d mean = -(w11 sum(g z1) + w21 sum(g z2), w22 sum(g z2))
+//! d w11 = sum(g z1^2) / w11           d w22  = (sum(g z2^2) - w21 / w11 sum(g z1 z2)) / w22
+//! d w21 = sum(g z1 z2) / w11
 //! ```
 
 use super::super::intersect::TILE;
 use super::super::real::Real;
-use super::splat::{BLOCKS, HALVES, LANES, Lanes, Splat, Thresholds, half_of, pixel_centres};
-use super::{GEOMETRY, View};
+use super::super::simd::prefetch;
+use super::View;
+use super::blocks::Blocks;
+use super::splat::{AHEAD, Centres, LANES, Lanes, PIXELS, Splat, Thresholds, block, block_mut};
+
+/// Sums per splat before those of its D colours.
+pub(super) const MOMENTS: usize = 6;
 
 /// Per-pixel data of one camera that the backward starts from.
 pub(super) struct Upstream<'a, T> {
     pub(super) grad: &'a [T],
     pub(super) transmittance: &'a [T],
-    pub(super) stop: &'a [u32],
-}
-
-/// What a block's pixels carry along.
-#[derive(Clone, Copy)]
-struct Block<T> {
-    /// Transmittance behind the splats walked so far; in front of them after the next one.
-    transmittance: Lanes<T>,
-    /// What lies behind, as the loss sees it: sum of (c . grad) alpha T over the splats behind, plus
-    /// the final transmittance times (background . grad - grad of alpha).
-    behind: Lanes<T>,
-    /// The place of the splat before which the pixel stopped.
-    stop: Lanes<u32>,
-}
-
-/// Sums of a splat's gradients over the pixels of a tile, one per lane.
-struct Sums<T> {
-    z1: Lanes<T>,
-    z2: Lanes<T>,
-    w11: Lanes<T>,
-    w21: Lanes<T>,
-    w22: Lanes<T>,
-    opacity: Lanes<T>,
+    pub(super) stop: &'a [i32],
 }
 
 /// The pixels of a tile while they are walked back to front.
 pub(super) struct GradientTile<T> {
-    /// Gradient of the D colours, D lanes per block.
-    grad: Vec<Lanes<T>>,
-    blocks: [Block<T>; BLOCKS],
+    /// Transmittance behind the splats walked so far; in front of them after the next one.
+    transmittance: [T; PIXELS],
+    /// What lies behind, as the loss sees it: sum of (c . grad) alpha T over the splats behind, plus
+    /// the final transmittance times (background . grad - grad of alpha).
+    behind: [T; PIXELS],
+    /// The place of the splat before which the pixel stopped.
+    stop: [i32; PIXELS],
+    /// D planes: gradient of the image.
+    grad: Vec<[T; PIXELS]>,
 }
 
 impl<T: Real> GradientTile<T> {
-    /// Reads the tile's pixels, and adds its share of the background's gradient, `sum of T_final grad`.
+    pub(super) fn new(channels: usize) -> Self {
+        Self {
+            transmittance: [T::ONE; PIXELS],
+            behind: [T::ZERO; PIXELS],
+            stop: [0; PIXELS],
+            grad: vec![[T::ZERO; PIXELS]; channels],
+        }
+    }
+
+    /// Reads the tile's pixels, and adds its share of the background's gradient, `sum of T_final grad`. Pixels outside
+    /// of the image have blended nothing.
     #[inline(always)]
     pub(super) fn load(
+        &mut self,
         view: &View<T>,
         upstream: &Upstream<T>,
-        tx: usize,
-        ty: usize,
+        [tx, ty]: [usize; 2],
+        channels: usize,
         background: &mut [T],
-    ) -> Self {
-        let d = view.channels;
-        let (columns, rows) = view.inside(tx, ty);
-        let nothing = Block {
-            transmittance: [T::ONE; LANES],
-            behind: [T::ZERO; LANES],
-            stop: [0; LANES],
-        };
-        let mut tile = Self {
-            grad: vec![[T::ZERO; LANES]; BLOCKS * d],
-            blocks: [nothing; BLOCKS],
-        };
+    ) {
+        self.transmittance = [T::ONE; PIXELS];
+        self.behind = [T::ZERO; PIXELS];
+        self.stop = [0; PIXELS];
+        self.grad.fill([T::ZERO; PIXELS]);
+        let [columns, rows] = view.inside([tx, ty]);
         for row in 0..rows {
             for column in 0..columns {
-                let (block, i) = (row * HALVES + column / LANES, column % LANES);
+                let at = row * TILE + column;
                 let pixel = (ty * TILE + row) * view.width + tx * TILE + column;
-                let grad = &upstream.grad[pixel * (d + 1)..(pixel + 1) * (d + 1)];
+                let grad = &upstream.grad[pixel * (channels + 1)..(pixel + 1) * (channels + 1)];
                 let left = upstream.transmittance[pixel];
-                let mut behind = -grad[d];
-                for channel in 0..d {
-                    tile.grad[block * d + channel][i] = grad[channel];
+                let mut behind = -grad[channels];
+                for channel in 0..channels {
+                    self.grad[channel][at] = grad[channel];
                     background[channel] += left * grad[channel];
                     if let Some(color) = view.background {
                         behind += color[channel] * grad[channel];
                     }
                 }
-                let block = &mut tile.blocks[block];
-                block.transmittance[i] = left;
-                block.behind[i] = left * behind;
-                block.stop[i] = upstream.stop[pixel];
+                self.transmittance[at] = left;
+                self.behind[at] = left * behind;
+                self.stop[at] = upstream.stop[pixel];
             }
         }
-        tile
     }
 
-    /// Walks the list back to front and writes the partial gradients of each splat, `6 + D` values.
+    /// Walks the list back to front and writes the sums of each splat over the tile, `MOMENTS + D` values. The list's pairs
+    /// have the `blocks` from the `first` on, which end at the given one.
     #[inline(always)]
     pub(super) fn walk<const FMA: bool>(
-        mut self,
+        &mut self,
         view: &View<T>,
         ranks: &[u32],
-        tx: usize,
-        ty: usize,
+        tile: [usize; 2],
+        channels: usize,
+        (blocks, first, mut end): (&Blocks, usize, usize),
         partials: &mut [T],
     ) {
-        let d = view.channels;
+        let width = MOMENTS + channels;
         let thresholds = Thresholds::<T>::new(view.args);
-        let (xs, ys) = (pixel_centres::<T>(tx * TILE), pixel_centres::<T>(ty * TILE));
-        let halves: [Lanes<T>; HALVES] = core::array::from_fn(|half| half_of(&xs, half));
-        // One past the last place that any pixel of the block has blended.
-        let mut ends = [0usize; BLOCKS];
-        for (end, block) in ends.iter_mut().zip(&self.blocks) {
-            let latest = block.stop.iter().fold(0, |latest, stop| latest.max(*stop));
-            *end = ranks.len().min(latest as usize);
-        }
-        let depth = ends.into_iter().fold(0, usize::max);
-        let mut color_sums = vec![[T::ZERO; LANES]; d];
+        let centres = Centres::<T>::new(tile);
+        let mut color_sums = vec![[T::ZERO; LANES]; channels];
 
-        for place in (0..depth).rev() {
-            let rank = ranks[place] as usize;
+        for (place, rank) in ranks.iter().enumerate().rev() {
+            let rank = *rank as usize;
             let splat = &view.splats[rank];
-            let color = &view.colors[rank * d..(rank + 1) * d];
-            let (from, to) = splat.spans(&ys);
-            let mut sums = Sums::zero();
+            let color = &view.colors[rank * channels..][..channels];
+            prefetch(view.splats, ranks.get(place.wrapping_sub(AHEAD)));
+            let mut sums = [[T::ZERO; LANES]; MOMENTS];
             color_sums.fill([T::ZERO; LANES]);
-            for row in splat.rows(ty * TILE) {
-                let dy = ys[row] - splat.mean[1];
-                for half in 0..HALVES {
-                    let (x, block) = (&halves[half], row * HALVES + half);
-                    if !(place < ends[block] && to[row] >= x[0] && from[row] <= x[LANES - 1]) {
-                        continue;
-                    }
-                    self.blocks[block].step::<FMA>(
-                        splat,
-                        color,
-                        x,
-                        dy,
-                        place as u32,
-                        &thresholds,
-                        &self.grad[block * d..(block + 1) * d],
-                        &mut sums,
-                        &mut color_sums,
-                    );
-                }
+            for at in blocks.before(&mut end, first + place) {
+                let at = usize::from(*at);
+                self.step::<FMA>(
+                    splat,
+                    color,
+                    &centres,
+                    at,
+                    place as i32,
+                    &thresholds,
+                    &mut sums,
+                    &mut color_sums,
+                );
             }
-            let out = &mut partials[place * (GEOMETRY + d)..(place + 1) * (GEOMETRY + d)];
-            out[..GEOMETRY].copy_from_slice(&sums.total(splat));
-            for (out, lanes) in out[GEOMETRY..].iter_mut().zip(&color_sums) {
+            // Or else the compiler takes the lanes apart for the totals already in the loop.
+            let (sums, color_sums) = core::hint::black_box((&sums, &color_sums));
+            let out = &mut partials[place * width..(place + 1) * width];
+            for (out, lanes) in out.iter_mut().zip(sums.iter().chain(color_sums)) {
                 *out = total(lanes);
             }
         }
     }
-}
 
-impl<T: Real> Block<T> {
-    /// Steps in front of one splat, and adds its gradients at the block's pixels.
+    /// Steps in front of one splat in the block that begins `at` a pixel, and adds to its sums.
     #[inline(always)]
     fn step<const FMA: bool>(
         &mut self,
         splat: &Splat<T>,
         color: &[T],
-        x: &Lanes<T>,
-        dy: T,
-        place: u32,
+        centres: &Centres<T>,
+        at: usize,
+        place: i32,
         thresholds: &Thresholds<T>,
-        grad: &[Lanes<T>],
-        sums: &mut Sums<T>,
+        sums: &mut [Lanes<T>; MOMENTS],
         color_sums: &mut [Lanes<T>],
     ) {
-        let w22_dy = splat.w22 * dy;
+        let (dx, dy) = centres.from(splat.mean, at);
+        let w22_dy = splat.along_y(dy);
+        let planes = &self.grad[..color.len()];
         let mut color_grad = [T::ZERO; LANES];
-        for (lanes, color) in grad.iter().zip(color) {
-            let color = *color;
+        for (plane, color) in planes.iter().zip(color) {
+            let (lanes, color) = (block(plane, at), *color);
             for i in 0..LANES {
                 color_grad[i] = T::multiply_add::<FMA>(color, lanes[i], color_grad[i]);
             }
         }
+        // Copies: behind references they might alias what is written, which bars SIMD.
+        let mut transmittance = *block(&self.transmittance, at);
+        let (mut behind, stop) = (*block(&self.behind, at), *block(&self.stop, at));
+        let [mut one, mut z1s, mut z2s, mut z11, mut z12, mut z22] = *sums;
         let mut weights = [T::ZERO; LANES];
-        // Copies: behind the references they might alias what is written, which bars SIMD.
-        let Block {
-            mut transmittance,
-            mut behind,
-            stop,
-        } = *self;
-        let Sums {
-            mut z1,
-            mut z2,
-            mut w11,
-            mut w21,
-            mut w22,
-            mut opacity,
-        } = *sums;
         for i in 0..LANES {
-            let dx = x[i] - splat.mean[0];
-            let (u1, u2, falloff) = splat.falloff::<FMA>(dx, w22_dy);
+            let (z1, z2, falloff) = splat.falloff::<FMA>(dx[i], w22_dy);
             let raw = splat.opacity * falloff;
-            let alpha = thresholds.alpha(raw);
             let blended = thresholds.seen(raw) & (place < stop[i]);
             // Every store is unconditional: masked ones are slow. Without a share nothing changes, exactly.
-            let share = if blended { alpha } else { T::ZERO };
+            let share = if blended {
+                thresholds.alpha(raw)
+            } else {
+                T::ZERO
+            };
             let inverse = T::ONE / (T::ONE - share);
             let before = transmittance[i] * inverse;
             let weight = share * before;
             let dalpha = before * color_grad[i] - behind[i] * inverse;
-            let draw = if blended & !thresholds.capped(raw) {
-                dalpha
-            } else {
-                T::ZERO
-            };
+            let live = blended & !thresholds.capped(raw);
+            let g = if live { -raw * dalpha } else { T::ZERO };
             weights[i] = weight;
             behind[i] = T::multiply_add::<FMA>(weight, color_grad[i], behind[i]);
             transmittance[i] = before;
 
-            let dsigma = -raw * draw;
-            let (dz1, dz2) = (u1 * dsigma, u2 * dsigma);
-            opacity[i] = T::multiply_add::<FMA>(falloff, draw, opacity[i]);
-            z1[i] += dz1;
-            z2[i] += dz2;
-            w11[i] = T::multiply_add::<FMA>(dz1, dx, w11[i]);
-            w21[i] = T::multiply_add::<FMA>(dz2, dx, w21[i]);
-            w22[i] = T::multiply_add::<FMA>(dz2, dy, w22[i]);
+            let (g1, g2) = (g * z1, g * z2);
+            one[i] += g;
+            z1s[i] += g1;
+            z2s[i] += g2;
+            z11[i] = T::multiply_add::<FMA>(g1, z1, z11[i]);
+            z12[i] = T::multiply_add::<FMA>(g1, z2, z12[i]);
+            z22[i] = T::multiply_add::<FMA>(g2, z2, z22[i]);
         }
-        self.transmittance = transmittance;
-        self.behind = behind;
-        *sums = Sums {
-            z1,
-            z2,
-            w11,
-            w21,
-            w22,
-            opacity,
-        };
-        for (sum, lanes) in color_sums.iter_mut().zip(grad) {
+        *block_mut(&mut self.transmittance, at) = transmittance;
+        *block_mut(&mut self.behind, at) = behind;
+        *sums = [one, z1s, z2s, z11, z12, z22];
+        for (sum, plane) in color_sums[..color.len()].iter_mut().zip(planes) {
+            let (lanes, mut total) = (block(plane, at), *sum);
             for i in 0..LANES {
-                sum[i] = T::multiply_add::<FMA>(weights[i], lanes[i], sum[i]);
+                total[i] = T::multiply_add::<FMA>(weights[i], lanes[i], total[i]);
             }
+            *sum = total;
         }
     }
 }
 
-impl<T: Real> Sums<T> {
-    #[inline(always)]
-    fn zero() -> Self {
-        let zero = [T::ZERO; LANES];
-        Self {
-            z1: zero,
-            z2: zero,
-            w11: zero,
-            w21: zero,
-            w22: zero,
-            opacity: zero,
-        }
-    }
-
-    /// Gradients of screen mean, w11, w21, w22 and opacity.
-    #[inline(always)]
-    fn total(&self, splat: &Splat<T>) -> [T; GEOMETRY] {
-        let (dz1, dz2) = (total(&self.z1), total(&self.z2));
-        [
-            -(splat.w11 * dz1 + splat.w21 * dz2),
-            -(splat.w22 * dz2),
-            total(&self.w11),
-            total(&self.w21),
-            total(&self.w22),
-            total(&self.opacity),
-        ]
-    }
-}
-
+/// Sum over the lanes: halves are added to halves.
 #[inline(always)]
 fn total<T: Real>(lanes: &Lanes<T>) -> T {
-    lanes.iter().copied().sum()
+    let (mut sums, mut width) = (*lanes, LANES);
+    while width > 1 {
+        width /= 2;
+        for i in 0..width {
+            sums[i] += sums[i + width];
+        }
+    }
+    sums[0]
 }

@@ -4,23 +4,30 @@ use super::super::intersect::{Footprint, TILE};
 use super::super::real::Real;
 use crate::settings::RasterizeArgs;
 
-/// Pixels that are worked on at once: half a row of a tile.
-pub(super) const LANES: usize = 8;
-/// Blocks of [`LANES`] pixels in a row of a tile.
-pub(super) const HALVES: usize = TILE / LANES;
-/// Blocks of a tile, row by row.
-pub(super) const BLOCKS: usize = TILE * HALVES;
+/// Pixels that are worked on at once, a block: half a row of a tile, wherever it begins.
+pub(super) const LANES: usize = TILE / 2;
 
 /// One value per pixel of a block.
 pub(super) type Lanes<T> = [T; LANES];
 
-/// What the inner loops need of a splat, computed once per view.
-#[derive(Clone, Copy)]
+/// Pixels of a tile.
+pub(super) const PIXELS: usize = TILE * TILE;
+
+/// So many splats before its turn a splat is fetched: it lies anywhere in memory.
+pub(super) const AHEAD: usize = 4;
+
+/// The inverse Cholesky factor times this, squared, counts in powers of two: `2^-|z|^2 = exp(-sigma)`.
+/// `sqrt(log2(e) / 2)`.
+const UNIT: f64 = 0.849_321_800_288_019_1;
+
+/// What the inner loops need of a splat.
+#[derive(Debug, Clone, Copy)]
 pub(super) struct Splat<T> {
     pub(super) mean: [T; 2],
-    pub(super) w11: T,
-    pub(super) w21: T,
-    pub(super) w22: T,
+    /// [`UNIT`] times the inverse Cholesky factor.
+    w11: T,
+    w21: T,
+    w22: T,
     pub(super) opacity: T,
     /// The pixel rows that the ellipse reaches, with a pixel of slack.
     rows: [T; 2],
@@ -32,69 +39,139 @@ pub(super) struct Splat<T> {
 }
 
 impl<T: Real> Splat<T> {
-    /// `None` for a splat that is seen nowhere, as [`Footprint::new`] has it.
-    pub(super) fn new(packed: &[T], opacity: T, args: &RasterizeArgs) -> Option<Self> {
-        let Footprint {
+    pub(super) fn new(footprint: &Footprint<T>) -> Self {
+        let unit = T::of(UNIT);
+        let Footprint { mean, half, .. } = *footprint;
+        Self {
             mean,
-            w11,
-            w21,
-            w22,
-            cut,
-            half,
-        } = Footprint::new(packed, opacity, args)?;
-        let a = w11 * w11 + w21 * w21;
-        let inverse_a = T::ONE / a;
-        Some(Self {
-            mean,
-            w11,
-            w21,
-            w22,
-            opacity,
+            w11: footprint.w11 * unit,
+            w21: footprint.w21 * unit,
+            w22: footprint.w22 * unit,
+            opacity: footprint.opacity,
             rows: [mean[1] - half[1] - T::ONE, mean[1] + half[1] + T::ONE],
-            slope: -w21 * w22 * inverse_a,
-            reach: (cut + cut) * a,
-            shrink: w11 * w22 * w11 * w22,
-            inverse_a,
-        })
-    }
-
-    /// Rows of the tile beginning at pixel row `y0` that the ellipse reaches.
-    #[inline(always)]
-    pub(super) fn rows(&self, y0: usize) -> core::ops::Range<usize> {
-        let row = |y: T| ((y.wide() - y0 as f64).max(0.0) as usize).min(TILE);
-        row(self.rows[0])..row(self.rows[1])
-    }
-
-    /// Per row of a tile, the columns that the ellipse reaches, as x of pixel centres from and to;
-    /// an empty interval where it reaches none.
-    #[inline(always)]
-    pub(super) fn spans(&self, centres: &[T; TILE]) -> ([T; TILE], [T; TILE]) {
-        // A thousandth of a pixel stands for rounding.
-        let (slack, none) = (T::of(1e-3), T::of(-1e30));
-        let (mut from, mut to) = ([T::ZERO; TILE], [T::ZERO; TILE]);
-        for row in 0..TILE {
-            let dy = centres[row] - self.mean[1];
-            let discriminant = self.reach - self.shrink * dy * dy;
-            let middle = self.mean[0] + self.slope * dy;
-            let half = discriminant.greatest(T::ZERO).sqrt() * self.inverse_a + slack;
-            from[row] = middle - half;
-            to[row] = if discriminant >= T::ZERO {
-                middle + half
-            } else {
-                none
-            };
+            slope: footprint.slope,
+            reach: footprint.reach,
+            shrink: footprint.shrink,
+            inverse_a: footprint.inverse_a,
         }
-        (from, to)
     }
 
-    /// (z1, z2, exp(-sigma)) at dx from the mean, `w22_dy` being w22 dy. Both passes call it, so both see
-    /// the same bits.
+    /// Rows of the tile that the ellipse reaches.
+    #[inline(always)]
+    pub(super) fn rows(&self, tile: &Centres<T>) -> core::ops::Range<usize> {
+        let (top, side) = (tile.ys[0], T::of(TILE as f64));
+        let row = |y: T| (y - top).greatest(T::ZERO).least(side).nearest() as usize;
+        row(self.rows[0])..TILE.min(row(self.rows[1]))
+    }
+
+    /// The columns that the ellipse reaches in each row of the tile.
+    #[inline(always)]
+    pub(super) fn spans(&self, tile: &Centres<T>) -> Window {
+        // A thousandth of a pixel stands for rounding.
+        let (slack, half_pixel, side) = (T::of(1e-3), T::of(0.5), T::of(TILE as f64));
+        let left = self.mean[0] - tile.xs[0] + half_pixel;
+        let mut spans = Window::CLOSED;
+        for row in 0..TILE {
+            let dy = tile.ys[row] - self.mean[1];
+            let discriminant = self.reach - self.shrink * dy * dy;
+            let middle = left + self.slope * dy;
+            let half = discriminant.greatest(T::ZERO).sqrt() * self.inverse_a + slack;
+            // From the first column that is not left of the span to the first that is right of it.
+            let from = (middle - half).greatest(T::ZERO).least(side);
+            let to = (middle + half).greatest(T::ZERO).least(side);
+            let to = if discriminant >= T::ZERO { to } else { T::ZERO };
+            spans.from[row] = from.nearest();
+            spans.to[row] = to.nearest();
+        }
+        spans
+    }
+
+    /// (z1, z2, exp(-sigma)) at dx from the mean, z in units of [`UNIT`], `w22_dy` being that of
+    /// [`along_y`](Self::along_y). Both passes call it, so both see the same bits.
     #[inline(always)]
     pub(super) fn falloff<const FMA: bool>(&self, dx: T, w22_dy: T) -> (T, T, T) {
         let z1 = self.w11 * dx;
         let z2 = T::multiply_add::<FMA>(self.w21, dx, w22_dy);
-        let sigma = T::of(0.5) * T::multiply_add::<FMA>(z1, z1, z2 * z2);
-        (z1, z2, T::exp_neg::<FMA>(sigma))
+        (
+            z1,
+            z2,
+            T::exp2_neg::<FMA>(T::multiply_add::<FMA>(z1, z1, z2 * z2)),
+        )
+    }
+
+    /// What all pixels of a row have in common, dy from the mean.
+    #[inline(always)]
+    pub(super) fn along_y(&self, dy: T) -> T {
+        self.w22 * dy
+    }
+
+    /// Gradients of screen mean, w11, w21, w22, and of the opacity, from a splat's sums of g times 1, z1, z2, z1^2, z1 z2
+    /// and z2^2; see the formulas in `gradient.rs`.
+    #[inline(always)]
+    pub(super) fn gradients(&self, [one, z1, z2, z11, z12, z22]: [T; 6]) -> ([T; 5], T) {
+        let (unit, square) = (T::of(UNIT), T::of(UNIT * UNIT));
+        let Self { w11, w21, w22, .. } = *self;
+        let geometry = [
+            -(w11 * z1 + w21 * z2) / square,
+            -(w22 * z2) / square,
+            z11 / (w11 * unit),
+            z12 / (w11 * unit),
+            (z22 - w21 / w11 * z12) / (w22 * unit),
+        ];
+        (geometry, -one / self.opacity)
+    }
+}
+
+/// A half-open interval of columns for each row of a tile; empty where `from` is not less than `to`.
+#[derive(Clone, Copy)]
+pub(super) struct Window {
+    pub(super) from: [i32; TILE],
+    pub(super) to: [i32; TILE],
+}
+
+impl Window {
+    pub(super) const CLOSED: Self = Self {
+        from: [0; TILE],
+        to: [0; TILE],
+    };
+}
+
+/// The values of the block that begins `at` a pixel, which lies within the tile.
+#[inline(always)]
+pub(super) fn block<V, const N: usize>(values: &[V; N], at: usize) -> &Lanes<V> {
+    let values = &values[at.min(N - LANES)..];
+    values.first_chunk().expect("a block is left")
+}
+
+/// As [`block`].
+#[inline(always)]
+pub(super) fn block_mut<V, const N: usize>(values: &mut [V; N], at: usize) -> &mut Lanes<V> {
+    let values = &mut values[at.min(N - LANES)..];
+    values.first_chunk_mut().expect("a block is left")
+}
+
+/// Centres of the pixels of a tile.
+pub(super) struct Centres<T> {
+    xs: [T; TILE],
+    ys: [T; TILE],
+}
+
+impl<T: Real> Centres<T> {
+    #[inline(always)]
+    pub(super) fn new([tx, ty]: [usize; 2]) -> Self {
+        let along = |tile: usize| core::array::from_fn(|i| T::of((tile * TILE + i) as f64 + 0.5));
+        Self {
+            xs: along(tx),
+            ys: along(ty),
+        }
+    }
+
+    /// From a splat's mean to the pixels of the block that begins `at` one: along x of each, along y of all.
+    #[inline(always)]
+    pub(super) fn from(&self, mean: [T; 2], at: usize) -> (Lanes<T>, T) {
+        let xs = block(&self.xs, at % TILE);
+        let dx = core::array::from_fn(|i| xs[i] - mean[0]);
+        (dx, self.ys[at / TILE % TILE] - mean[1])
     }
 }
 
@@ -135,16 +212,4 @@ impl<T: Real> Thresholds<T> {
     pub(super) fn stops(&self, transmittance_after: T) -> bool {
         transmittance_after < self.transmittance_min
     }
-}
-
-/// Centres of the sixteen pixels from `first` on, along one axis.
-#[inline(always)]
-pub(super) fn pixel_centres<T: Real>(first: usize) -> [T; TILE] {
-    core::array::from_fn(|i| T::of((first + i) as f64 + 0.5))
-}
-
-/// The half of a row's values that belongs to a block.
-#[inline(always)]
-pub(super) fn half_of<T: Real>(row: &[T; TILE], half: usize) -> Lanes<T> {
-    core::array::from_fn(|i| row[half * LANES + i])
 }
