@@ -6,6 +6,8 @@ pub mod capture;
 pub mod cli;
 mod evaluate;
 pub mod gradcheck;
+#[cfg(feature = "cpu")]
+pub mod performance;
 pub mod report;
 pub mod train;
 

@@ -197,3 +197,81 @@ fn bad_scenes_are_refused_in_one_line() {
     fs::write(&scene, "no splats here").unwrap();
     refused(&splat(&["info", text(&scene)]), &out, &["nan.ply"]);
 }
+
+#[test]
+fn benches_of_speed_leave_their_figures() {
+    let folder = TempDir::new().unwrap();
+    let capture = example(folder.path());
+    let json = folder.path().join("figures.json");
+    let svg = folder.path().join("picture.svg");
+    let figures = |arguments: &[&str]| -> serde_json::Value {
+        let output = splat(&[&["bench"], arguments, &["--json", text(&json)]].concat());
+        succeed(&output);
+        assert!(String::from_utf8_lossy(&output.stdout).contains("median ms"));
+        serde_json::from_slice(&fs::read(&json).unwrap()).unwrap()
+    };
+    let small = ["--downscale", "16", "--seconds", "0"];
+
+    let step = figures(&[&["step", text(&capture), "--svg", text(&svg)], &small[..]].concat());
+    let rows = step["rows"].as_array().unwrap();
+    for degree in [0, 3] {
+        let row = rows.iter().find(|row| row["sh_degree"] == degree).unwrap();
+        assert_eq!(row["steps"], 20);
+        assert!(row["milliseconds"]["median"].as_f64().unwrap() > 0.0);
+        let stages = row["stages"].as_array().unwrap();
+        assert!(stages.iter().any(|stage| stage[0] == "rasterize gradient"));
+        assert_eq!(stages.last().unwrap()[0], "rest (Burn and the trainer)");
+    }
+    let picture = fs::read_to_string(&svg).unwrap();
+    assert!(picture.contains("rasterize gradient") && picture.contains("</svg>"));
+
+    let rasterize = figures(&[&["rasterize", text(&capture)], &small[..]].concat());
+    assert_eq!(rasterize["work"]["views"], 8);
+    for direction in ["forward", "backward"] {
+        let rate = &rasterize["rows"][0][direction]["tested_per_second"];
+        assert!(rate.as_f64().unwrap() > 0.0, "{rasterize}");
+    }
+
+    let scaling = figures(&[
+        "scaling",
+        "--gaussians",
+        "200,2000",
+        "--pixels",
+        "3000,12000,48000",
+        "--svg",
+        text(&svg),
+    ]);
+    let points = scaling["points"].as_array().unwrap();
+    assert_eq!(points.len(), 6);
+    assert_eq!(points[1]["work"]["gaussians"], 2000);
+    assert_eq!(points[5]["work"]["pixels"], 48070.0);
+    if cfg!(target_os = "linux") {
+        assert!(points[0]["peak_rss_bytes"].as_u64().unwrap() > 1_000_000);
+        assert!(scaling["memory"]["per_gaussian"].as_f64().unwrap() >= 0.0);
+    }
+    assert!(fs::read_to_string(&svg).unwrap().contains("2k Gaussians"));
+}
+
+#[test]
+fn benches_refuse_what_they_cannot_measure_in_one_line() {
+    let folder = TempDir::new().unwrap();
+    let nowhere = folder.path().join("nowhere");
+    let bad: [(&[&str], &str); 5] = [
+        (&["step", text(&nowhere)], "nowhere"),
+        (&["rasterize", "a.ply"], "--capture"),
+        (&["step", text(&nowhere), "--downscale", "0"], "downscale"),
+        (&["scaling", "--gaussians", "10,0"], "--gaussians"),
+        (&["scaling", "--device", "wgpu"], "--device"),
+    ];
+    for (arguments, named) in bad {
+        let output = Command::new(env!("CARGO_BIN_EXE_splat"))
+            .arg("bench")
+            .args(arguments)
+            .output()
+            .unwrap();
+        let errors = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.code(), Some(2), "{errors}");
+        assert!(errors.contains(named), "{arguments:?}: {errors}");
+        assert_eq!(errors.trim_end().lines().count(), 1, "{errors}");
+    }
+}

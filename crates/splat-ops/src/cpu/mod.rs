@@ -2,10 +2,14 @@
 //!
 //! Parallel over Gaussians or rows of tiles with rayon, and deterministic: whatever is summed across
 //! threads is summed in a fixed order, so the same input gives the same bits on any number of threads.
+//!
+//! Every op runs in a `tracing` span of its name, level trace, on the caller's thread: one load and a branch where nobody
+//! listens.
 
 mod adam;
 mod blur;
 pub(crate) mod buffer;
+mod instructions;
 mod intersect;
 mod math;
 mod photometric;
@@ -20,6 +24,9 @@ mod spherical_harmonics;
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use burn::tensor::DType;
+use tracing::trace_span;
+
+pub use instructions::InstructionSet;
 
 pub use rasterize::{RasterizeWork, rasterize_work};
 
@@ -49,6 +56,7 @@ impl SplatBackend for Flex {
         intrinsics: FlexTensor,
         args: &ProjectArgs,
     ) -> FlexTensor {
+        let _span = trace_span!("project").entered();
         in_precision!(
             means,
             project::forward,
@@ -67,6 +75,7 @@ impl SplatBackend for Flex {
         args: &ProjectArgs,
         wanted: [bool; 5],
     ) -> [Option<FlexTensor>; 5] {
+        let _span = trace_span!("project gradient").entered();
         in_precision!(
             means,
             project::backward,
@@ -82,6 +91,7 @@ impl SplatBackend for Flex {
         dirs: FlexTensor,
         degree: usize,
     ) -> FlexTensor {
+        let _span = trace_span!("spherical harmonics").entered();
         in_precision!(coeffs, spherical_harmonics::forward, coeffs, dirs, degree)
     }
 
@@ -92,6 +102,7 @@ impl SplatBackend for Flex {
         degree: usize,
         wanted: [bool; 2],
     ) -> [Option<FlexTensor>; 2] {
+        let _span = trace_span!("spherical harmonics gradient").entered();
         in_precision!(
             coeffs,
             spherical_harmonics::backward,
@@ -110,6 +121,7 @@ impl SplatBackend for Flex {
         background: Option<FlexTensor>,
         args: &RasterizeArgs,
     ) -> (FlexTensor, Self::RasterizeState) {
+        let _span = trace_span!("rasterize").entered();
         in_precision!(
             packed,
             rasterize::forward,
@@ -130,6 +142,7 @@ impl SplatBackend for Flex {
         args: &RasterizeArgs,
         wanted: [bool; 4],
     ) -> [Option<FlexTensor>; 4] {
+        let _span = trace_span!("rasterize gradient").entered();
         in_precision!(
             packed,
             rasterize::backward,
@@ -143,10 +156,12 @@ impl SplatBackend for Flex {
     }
 
     fn gaussian_blur(image: FlexTensor, window: &[f64]) -> FlexTensor {
+        let _span = trace_span!("blur").entered();
         in_precision!(image, blur::blur, image, window)
     }
 
     fn photometric(rendered: FlexTensor, target: Target<Self>, args: &SsimArgs) -> FlexTensor {
+        let _span = trace_span!("photometric").entered();
         in_precision!(rendered, photometric::measure, rendered, target, args)
     }
 
@@ -155,6 +170,7 @@ impl SplatBackend for Flex {
         target: Target<Self>,
         args: &SsimArgs,
     ) -> (FlexTensor, FlexTensor) {
+        let _span = trace_span!("photometric").entered();
         in_precision!(
             rendered,
             photometric::measure_tracked,
@@ -170,6 +186,7 @@ impl SplatBackend for Flex {
         slope: FlexTensor,
         grad: FlexTensor,
     ) -> FlexTensor {
+        let _span = trace_span!("photometric gradient").entered();
         in_precision!(
             rendered,
             photometric::backward,
@@ -181,6 +198,7 @@ impl SplatBackend for Flex {
     }
 
     fn adam(tensors: [FlexTensor; 4], step: &AdamStep) -> [FlexTensor; 3] {
+        let _span = trace_span!("adam").entered();
         in_precision!(tensors[0], adam::step, tensors, step)
     }
 }

@@ -1,6 +1,8 @@
 //! Launches `splat-kernels` on CubeCL devices: CUDA, Vulkan, Metal, WebGPU.
 //!
 //! The kernels know buffers of f32 and sizes; here tensors become buffers and buffers tensors.
+//!
+//! The `tracing` spans have the names of those on the CPU, and last as long as it takes to launch the kernels: these run on.
 
 mod blur;
 mod project;
@@ -15,6 +17,7 @@ use burn_cubecl::CubeBackend;
 use burn_cubecl::kernel::{cast, into_contiguous};
 use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::Buffer;
+use tracing::trace_span;
 
 use crate::backend::SplatBackend;
 use crate::settings::{ProjectArgs, RasterizeArgs};
@@ -60,6 +63,7 @@ impl SplatBackend for CubeBackend {
         intrinsics: CubeTensor,
         args: &ProjectArgs,
     ) -> CubeTensor {
+        let _span = trace_span!("project").entered();
         project::forward([means, quats, scales, viewmats, intrinsics], args)
     }
 
@@ -73,6 +77,7 @@ impl SplatBackend for CubeBackend {
         args: &ProjectArgs,
         wanted: [bool; 5],
     ) -> [Option<CubeTensor>; 5] {
+        let _span = trace_span!("project gradient").entered();
         project::backward(
             [means, quats, scales, viewmats, intrinsics],
             grad_packed,
@@ -86,6 +91,7 @@ impl SplatBackend for CubeBackend {
         dirs: CubeTensor,
         degree: usize,
     ) -> CubeTensor {
+        let _span = trace_span!("spherical harmonics").entered();
         spherical_harmonics::forward(coeffs, dirs, degree)
     }
 
@@ -96,6 +102,7 @@ impl SplatBackend for CubeBackend {
         degree: usize,
         wanted: [bool; 2],
     ) -> [Option<CubeTensor>; 2] {
+        let _span = trace_span!("spherical harmonics gradient").entered();
         spherical_harmonics::backward(coeffs, dirs, grad, degree, wanted)
     }
 
@@ -106,6 +113,7 @@ impl SplatBackend for CubeBackend {
         background: Option<CubeTensor>,
         args: &RasterizeArgs,
     ) -> (CubeTensor, Self::RasterizeState) {
+        let _span = trace_span!("rasterize").entered();
         rasterize::forward(packed, colors, opacities, background, args)
     }
 
@@ -120,6 +128,7 @@ impl SplatBackend for CubeBackend {
         args: &RasterizeArgs,
         wanted: [bool; 4],
     ) -> [Option<CubeTensor>; 4] {
+        let _span = trace_span!("rasterize gradient").entered();
         rasterize::backward(
             packed,
             colors,
@@ -133,6 +142,7 @@ impl SplatBackend for CubeBackend {
     }
 
     fn gaussian_blur(image: CubeTensor, window: &[f64]) -> CubeTensor {
+        let _span = trace_span!("blur").entered();
         blur::blur(image, window)
     }
 }

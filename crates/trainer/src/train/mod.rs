@@ -23,6 +23,7 @@ use splat_model::{
     EditLog, Gaussians, InitError, project_gaussians, render_projected, scene_origin, scene_scale,
     splat_optimizer, splats_from_points,
 };
+use tracing::trace_span;
 
 use crate::capture::{Capture, CaptureError, View};
 use crate::evaluate::evaluate;
@@ -364,15 +365,9 @@ impl Trainer {
             found.into_iter().for_each(|warning| self.warn(warning));
         }
         while self.state.step < self.config.steps && !self.should_stop() {
-            let start = Instant::now();
             self.step()?;
             let last = self.state.step == self.config.steps;
-            let inspects = warnings::course::is_due(self.state.step, self.config.steps);
-            if self.unread.len() >= LOSS_BATCH || inspects {
-                self.read_losses()?;
-            }
-            self.state.elapsed += start.elapsed();
-            if inspects {
+            if warnings::course::is_due(self.state.step, self.config.steps) {
                 self.inspect_losses();
             }
             if self
@@ -424,7 +419,29 @@ impl Trainer {
         Ok(())
     }
 
-    fn step(&mut self) -> Result<(), TrainError> {
+    /// Takes the next step of the run, for whoever drives the loop instead of [`run`](Self::run), which also
+    /// watches, measures and keeps what becomes of it.
+    ///
+    /// # Errors
+    /// As those of [`run`](Self::run).
+    pub fn step(&mut self) -> Result<(), TrainError> {
+        let _span = trace_span!("step").entered();
+        let start = Instant::now();
+        self.update()?;
+        let inspects = warnings::course::is_due(self.state.step, self.config.steps);
+        if self.unread.len() >= LOSS_BATCH || inspects {
+            self.read_losses()?;
+        }
+        self.state.elapsed += start.elapsed();
+        Ok(())
+    }
+
+    /// The Gaussians as they are after the last step.
+    pub fn gaussians(&self) -> &Gaussians {
+        &self.gaussians
+    }
+
+    fn update(&mut self) -> Result<(), TrainError> {
         let step = self.state.step;
         let index = self.capture.split.train[self.views.at(step)];
         let factor = coarse::factor(&self.config, self.run, step);
@@ -434,6 +451,7 @@ impl Trainer {
             .tensors(&self.device);
         let settings = self.config.render_settings(self.sh_degree(step));
 
+        let render = trace_span!("render").entered();
         let mut projected = project_gaussians(&self.gaussians, &cameras, &settings)?;
         let extents = projected.extents();
         let probe = self.state.density.observes(step).then(|| {
@@ -444,16 +462,19 @@ impl Trainer {
             projected = projected.with_screen_probe(probe.clone())?;
         }
         let rendered = render_projected(&self.gaussians, &projected, &cameras, &settings)?;
-        let levels = views::levels(&view, &self.device);
+        drop(render);
+        let levels = trace_span!("photo").in_scope(|| views::levels(&view, &self.device));
         let target = TargetView::new(&view.name, levels, &cameras, step);
-        let Some((loss, terms)) = self.loss.evaluate(&target, &rendered)? else {
+        let evaluated = trace_span!("loss").in_scope(|| self.loss.evaluate(&target, &rendered))?;
+        let Some((loss, terms)) = evaluated else {
             return Err(TrainError::Loss("has no term"));
         };
         if !loss.is_tracked() {
             return Err(TrainError::Loss("does not depend on the rendered image"));
         }
-        let mut grads = loss.backward();
+        let mut grads = trace_span!("backward").in_scope(|| loss.backward());
         let screen_gradient = probe.and_then(|probe| probe.grad_remove(&mut grads));
+        let optimizer = trace_span!("optimizer").entered();
         let grads = GradientsParams::from_grads(grads, &self.gaussians);
         let rates = self
             .config
@@ -461,6 +482,7 @@ impl Trainer {
             .at(step, self.config.steps, self.run.scene_scale);
         let gaussians = self.gaussians.clone();
         self.gaussians = self.state.optimizer.step(rates, gaussians, grads);
+        drop(optimizer);
 
         let mut values = vec![loss.inner()];
         values.extend(terms);
@@ -470,6 +492,7 @@ impl Trainer {
             values,
         });
         self.state.step += 1;
+        let _density = trace_span!("density").entered();
         if let Some(gradient) = screen_gradient {
             self.state.density.observe(gradient, extents, cameras.size);
         }

@@ -1,15 +1,14 @@
-//! `splat bench`: error beside speed.
+//! `splat bench accuracy`: error beside speed.
 
 use std::path::PathBuf;
 
-use clap::{Args, ValueEnum};
+use clap::Args;
 
-use super::{DeviceChoice, Failure, GlobalArgs, device, print};
+use super::{DeviceChoice, Failure, GlobalArgs, device, print, write};
 use crate::accuracy::report::{Backend, Report};
 use crate::report::metrics::write_json;
-use crate::report::{ReportError, write_atomically};
 
-/// Measure errors beside speed
+/// The 38 hard cases: error of image and gradients, and time
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   splat bench accuracy
@@ -18,10 +17,7 @@ use crate::report::{ReportError, write_atomically};
 
 Without --device every backend of this machine is measured: the CPU, and what wgpu finds.
 Exit status: 0 every demand holds, 1 one does not, 2 bad input.")]
-pub struct BenchArgs {
-    /// What to measure
-    #[arg(value_enum, default_value = "accuracy", value_name = "NAME")]
-    pub names: Vec<Bench>,
+pub struct AccuracyArgs {
     /// Also write the figures as JSON
     #[arg(long, value_name = "OUT")]
     pub json: Option<PathBuf>,
@@ -30,15 +26,8 @@ pub struct BenchArgs {
     pub report: Option<PathBuf>,
 }
 
-/// What `splat bench` measures.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
-pub enum Bench {
-    /// The 38 hard cases: error of image and gradients, and time
-    Accuracy,
-}
-
 /// Runs the command.
-pub(super) fn run(args: &BenchArgs, global: &GlobalArgs) -> Result<(), Failure> {
+pub(super) fn run(args: &AccuracyArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let backends = backends(global)?;
     let report = Report::measure(&backends, |backend, case| {
         global.say(format_args!(
@@ -89,11 +78,6 @@ fn backends(global: &GlobalArgs) -> Result<Vec<Backend>, Failure> {
         }
         chosen => Ok(vec![one(chosen)?]),
     }
-}
-
-fn write(folder: &std::path::Path, name: &str, text: &str) -> Result<(), ReportError> {
-    let path = folder.join(name);
-    write_atomically(&path, text.as_bytes()).map_err(|source| ReportError::Io { path, source })
 }
 
 /// `docs/ACCURACY.md`.

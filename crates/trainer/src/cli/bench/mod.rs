@@ -1,0 +1,73 @@
+//! `splat bench`: errors, speed and how it grows.
+
+mod accuracy;
+mod input;
+mod performance;
+mod rasterize;
+mod scaling;
+mod step;
+
+use std::path::Path;
+
+use clap::{Args, Subcommand};
+
+use super::{DeviceChoice, Failure, GlobalArgs, device, print};
+use crate::report::{ReportError, write_atomically};
+
+/// Measure errors and speed
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  splat bench accuracy --report docs
+  splat bench step photos/ --downscale 2
+  splat bench performance --report docs")]
+pub struct BenchArgs {
+    #[command(subcommand)]
+    bench: Bench,
+}
+
+/// What `splat bench` measures.
+#[derive(Debug, Subcommand)]
+enum Bench {
+    Accuracy(accuracy::AccuracyArgs),
+    Step(step::StepArgs),
+    Rasterize(rasterize::RasterizeArgs),
+    Scaling(scaling::ScalingArgs),
+    Performance(performance::PerformanceArgs),
+    Point(scaling::PointArgs),
+}
+
+/// Runs the command.
+pub(super) fn run(args: &BenchArgs, global: &GlobalArgs) -> Result<(), Failure> {
+    match &args.bench {
+        Bench::Accuracy(args) => accuracy::run(args, global),
+        Bench::Step(args) => step::run(args, global),
+        Bench::Rasterize(args) => rasterize::run(args, global),
+        Bench::Scaling(args) => scaling::run(args, global),
+        Bench::Performance(args) => performance::run(args, global),
+        Bench::Point(args) => scaling::run_point(args, global),
+    }
+}
+
+/// Writes a file of a report.
+fn write(folder: &Path, name: &str, text: &str) -> Result<(), ReportError> {
+    let path = folder.join(name);
+    write_atomically(&path, text.as_bytes()).map_err(|source| ReportError::Io { path, source })
+}
+
+/// Writes a picture.
+fn write_svg(path: &Path, svg: Result<String, String>) -> Result<(), Failure> {
+    let svg = svg.map_err(Failure::Check)?;
+    let written = write_atomically(path, svg.as_bytes());
+    let path = path.to_owned();
+    Ok(written.map_err(|source| ReportError::Io { path, source })?)
+}
+
+/// The benches of speed measure the CPU path: another device is not what the user would get figures for.
+fn cpu_only(global: &GlobalArgs) -> Result<(), Failure> {
+    match global.device {
+        DeviceChoice::Auto | DeviceChoice::Cpu => Ok(()),
+        DeviceChoice::Wgpu | DeviceChoice::Cuda => Err(Failure::BadInput(
+            "--device: this bench measures the CPU path alone".to_owned(),
+        )),
+    }
+}

@@ -1,0 +1,113 @@
+//! `splat bench scaling`: how time and memory grow.
+
+use std::path::PathBuf;
+use std::process::Command;
+use std::time::Instant;
+
+use clap::Args;
+
+use super::{Failure, GlobalArgs, cpu_only, print, write_svg};
+use crate::performance::PerformanceError;
+use crate::performance::scaling::{GAUSSIANS, PIXELS, Point, ScalingReport, measure_point};
+use crate::report::metrics::write_json;
+
+/// Step time and memory on the CPU against Gaussians and pixels, on a synthetic scene
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  splat bench scaling
+  splat bench scaling --gaussians 10000,100000 --pixels 500000 --svg scaling.svg
+
+Takes some minutes: every point is measured in a process of its own.")]
+pub(super) struct ScalingArgs {
+    /// Numbers of Gaussians
+    #[arg(long, value_name = "N,N,...", value_delimiter = ',', default_values_t = GAUSSIANS)]
+    gaussians: Vec<usize>,
+    /// Numbers of pixels
+    #[arg(long, value_name = "P,P,...", value_delimiter = ',', default_values_t = PIXELS)]
+    pixels: Vec<usize>,
+    /// Also write the figures as JSON
+    #[arg(long, value_name = "OUT")]
+    json: Option<PathBuf>,
+    /// Also write the picture
+    #[arg(long, value_name = "OUT")]
+    svg: Option<PathBuf>,
+}
+
+/// One point of `splat bench scaling`, as JSON
+#[derive(Debug, Args)]
+#[command(hide = true)]
+pub(super) struct PointArgs {
+    /// Number of Gaussians
+    gaussians: usize,
+    /// Number of pixels
+    pixels: usize,
+}
+
+/// Runs the command.
+pub(super) fn run(args: &ScalingArgs, global: &GlobalArgs) -> Result<(), Failure> {
+    cpu_only(global)?;
+    let report = report(&args.gaussians, &args.pixels, global)?;
+    print(&format!("{}\n{}", report.machine.line(), report.markdown()));
+    if let Some(path) = &args.json {
+        write_json(path, &report)?;
+    }
+    if let Some(path) = &args.svg {
+        write_svg(path, report.svg())?;
+    }
+    Ok(())
+}
+
+/// Measures a point in this process.
+pub(super) fn run_point(args: &PointArgs, global: &GlobalArgs) -> Result<(), Failure> {
+    cpu_only(global)?;
+    let point = measure_point(args.gaussians, args.pixels)?;
+    print(&serde_json::to_string(&point)?);
+    Ok(())
+}
+
+/// Measures all points, each in a process of its own.
+pub(super) fn report(
+    gaussians: &[usize],
+    pixels: &[usize],
+    global: &GlobalArgs,
+) -> Result<ScalingReport, Failure> {
+    if let Some(field) = [("--gaussians", gaussians), ("--pixels", pixels)]
+        .into_iter()
+        .find_map(|(field, counts)| counts.contains(&0).then_some(field))
+    {
+        return Err(Failure::BadInput(format!("{field} must be at least 1")));
+    }
+    let mut done = 0;
+    let start = Instant::now();
+    let measured = ScalingReport::of(gaussians, pixels, |gaussians, pixels| {
+        done += 1;
+        global.say(format_args!(
+            "point {done}, {gaussians} Gaussians and {pixels} pixels, after {:.0} s",
+            start.elapsed().as_secs_f64()
+        ));
+        child(gaussians, pixels)
+    });
+    Ok(measured?)
+}
+
+/// Runs `splat bench point`.
+fn child(gaussians: usize, pixels: usize) -> Result<Point, PerformanceError> {
+    let failed = |reason: String| PerformanceError::Point {
+        gaussians,
+        pixels,
+        reason,
+    };
+    let program = std::env::current_exe().map_err(|error| failed(error.to_string()))?;
+    let output = Command::new(program)
+        .args(["--device", "cpu", "--quiet", "bench", "point"])
+        .args([gaussians, pixels].map(|count| count.to_string()))
+        .output()
+        .map_err(|error| failed(error.to_string()))?;
+    if !output.status.success() {
+        let said = String::from_utf8_lossy(&output.stderr);
+        let words: Vec<&str> = said.split_whitespace().collect();
+        // What runs out of memory says nothing.
+        return Err(failed(format!("{} {}", output.status, words.join(" "))));
+    }
+    serde_json::from_slice(&output.stdout).map_err(|error| failed(error.to_string()))
+}

@@ -1,0 +1,295 @@
+//! The rasteriser: (pixel, Gaussian) evaluations per second and core, on the lists of a real scene.
+
+use std::fmt::Write;
+use std::time::{Duration, Instant};
+
+use burn::tensor::Device;
+use serde::Serialize;
+use splat_model::files::SplatData;
+use splat_model::{Gaussians, RenderSettings, render};
+use splat_ops::cpu::InstructionSet;
+
+use super::stages::{Recording, Stage};
+use super::work::sample;
+use super::{Machine, PerformanceError, Spread, Work, all_threads, on_threads};
+use crate::capture::View;
+use crate::train::{camera, photo};
+
+/// Views rendered.
+const VIEWS: usize = 8;
+/// Passes over the views before the clock starts.
+const WARM_UP: usize = 1;
+/// Passes over the views that are measured, unless time is up.
+const PASSES: usize = 30;
+
+/// 1e9 evaluations per second and core.
+struct Limit {
+    instructions: &'static str,
+    /// What the arithmetic of the inner loop reached on a machine with AVX-512: a tile of 16 x 16 pixels with 256 splats,
+    /// in cache. Not every direction was measured.
+    forward: f64,
+    backward: Option<f64>,
+    /// What the rasteriser shall reach, forward and backward.
+    goal: Option<[f64; 2]>,
+}
+
+const AVX512: Limit = Limit {
+    instructions: "AVX-512",
+    forward: 3.6,
+    backward: Some(1.2),
+    goal: Some([2.5, 0.8]),
+};
+
+const AVX2: Limit = Limit {
+    instructions: "AVX2",
+    forward: 2.0,
+    backward: None,
+    goal: Some([1.4, 0.5]),
+};
+
+const BASELINE: Limit = Limit {
+    instructions: "scalar, libm",
+    forward: 0.1,
+    backward: None,
+    goal: None,
+};
+
+/// The limit of the instructions that ran. None was measured for NEON, whose vectors are half of AVX2's; it is held
+/// against AVX2.
+fn limit(instructions: InstructionSet) -> Limit {
+    match instructions {
+        InstructionSet::Avx2 | InstructionSet::Neon => AVX2,
+        InstructionSet::Baseline => BASELINE,
+    }
+}
+
+/// The rasteriser on the views of a capture.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RasterizeReport {
+    /// Where and when.
+    pub machine: Machine,
+    /// What was rendered.
+    pub scene: String,
+    /// The work of a view.
+    pub work: Work,
+    /// One per number of threads.
+    pub rows: Vec<RasterizeRow>,
+}
+
+/// A number of threads.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RasterizeRow {
+    /// Threads.
+    pub threads: usize,
+    /// Passes over the views.
+    pub passes: usize,
+    /// Tile lists, milliseconds per view. Absent where the rasteriser does not time them apart from the blending.
+    pub lists: Option<Spread>,
+    /// Blending, with the lists where these are not apart.
+    pub forward: Rate,
+    /// Its gradient.
+    pub backward: Rate,
+}
+
+/// How fast the evaluations of a view are done. Both directions count those of the forward pass.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Rate {
+    /// Milliseconds per view.
+    pub milliseconds: Spread,
+    /// Pairs tested per second and thread, in the median time.
+    pub tested_per_second: f64,
+    /// Pairs blended per second and thread, in the median time.
+    pub blended_per_second: f64,
+}
+
+impl Rate {
+    fn new(milliseconds: Vec<f64>, work: &Work, threads: usize) -> Self {
+        let milliseconds = Spread::of(milliseconds);
+        let seconds = 1e-3 * milliseconds.median * threads as f64;
+        Self {
+            milliseconds,
+            tested_per_second: work.tested / seconds,
+            blended_per_second: work.blended / seconds,
+        }
+    }
+}
+
+/// Measures the rasteriser on up to eight of `views`, on one thread and on all; `seconds` bounds the time of each.
+///
+/// # Errors
+/// When the scene cannot be rendered.
+pub fn measure(
+    scene: &str,
+    data: &SplatData,
+    views: &[&View],
+    settings: &RenderSettings,
+    seconds: f64,
+    mut say: impl FnMut(&str),
+) -> Result<RasterizeReport, PerformanceError> {
+    let views = sample(views, VIEWS);
+    say("counting the work");
+    let device = Device::flex();
+    let work = Work::count(
+        &Gaussians::from_data(data, &device),
+        &views,
+        settings,
+        &device,
+    )?;
+    let mut rows = vec![];
+    for threads in all_threads() {
+        say(&format!(
+            "rasterising {} views on {threads} thread(s)",
+            views.len()
+        ));
+        let passes = on_threads(threads, || passes(data, &views, settings, seconds))?;
+        let per_view = |pass: &Pass, time: fn(&Pass) -> Duration| {
+            1e3 * time(pass).as_secs_f64() / views.len() as f64
+        };
+        let times =
+            |time: fn(&Pass) -> Duration| passes.iter().map(|pass| per_view(pass, time)).collect();
+        let apart = passes.iter().any(|pass| !pass.lists.is_zero());
+        rows.push(RasterizeRow {
+            threads,
+            passes: passes.len(),
+            lists: apart.then(|| Spread::of(times(|pass| pass.lists))),
+            forward: Rate::new(times(|pass| pass.forward), &work, threads),
+            backward: Rate::new(times(|pass| pass.backward), &work, threads),
+        });
+    }
+    Ok(RasterizeReport {
+        machine: Machine::here(),
+        scene: scene.to_owned(),
+        work,
+        rows,
+    })
+}
+
+/// Time of the rasteriser's spans, over all views.
+#[derive(Default)]
+struct Pass {
+    lists: Duration,
+    forward: Duration,
+    backward: Duration,
+}
+
+impl Pass {
+    fn add(&mut self, stages: &[Stage]) {
+        for stage in stages {
+            match stage.name {
+                "rasterize lists" => self.lists += stage.whole,
+                "rasterize" => self.forward += stage.own,
+                "rasterize gradient" => self.backward += stage.own,
+                _ => {}
+            }
+        }
+    }
+}
+
+/// Renders the views and goes back through them, again and again.
+fn passes(
+    data: &SplatData,
+    views: &[&View],
+    settings: &RenderSettings,
+    seconds: f64,
+) -> Result<Vec<Pass>, PerformanceError> {
+    let device = Device::flex().autodiff();
+    let gaussians = Gaussians::from_data(data, &device);
+    let inputs: Vec<_> = views
+        .iter()
+        .map(|view| {
+            let camera = camera(view).relative_to(gaussians.origin);
+            (camera.tensors(&device), photo(view, &device))
+        })
+        .collect();
+    Recording::of(|recording| {
+        let mut passes = vec![];
+        let start = Instant::now();
+        for number in 0..WARM_UP + PASSES {
+            let mut pass = Pass::default();
+            for (cameras, photo) in &inputs {
+                let rendered = render(&gaussians, cameras, settings)?;
+                let difference = rendered.image() - photo.clone();
+                difference.square().mean().backward();
+                pass.add(&recording.take());
+            }
+            if number >= WARM_UP {
+                passes.push(pass);
+                if start.elapsed().as_secs_f64() > seconds {
+                    break;
+                }
+            }
+        }
+        Ok(passes)
+    })
+}
+
+impl RasterizeReport {
+    /// The tables.
+    pub fn markdown(&self) -> String {
+        let mut text = String::new();
+        // Writing into a string cannot fail.
+        let _ = self.write(&mut text);
+        text
+    }
+
+    fn write(&self, text: &mut String) -> std::fmt::Result {
+        writeln!(text, "Scene: {}.\n", self.scene)?;
+        writeln!(text, "{}", self.work.markdown())?;
+        let limit = limit(InstructionSet::chosen());
+        writeln!(
+            text,
+            "Time per view, and 1e9 pairs per second and thread. The loops ran with {}; goal and share of the limit are those \
+             of {}.{}\n",
+            self.machine.instructions,
+            limit.instructions,
+            if self.rows.iter().any(|row| row.lists.is_none()) {
+                " Forward includes making the lists."
+            } else {
+                ""
+            }
+        )?;
+        writeln!(
+            text,
+            "| threads | direction | median ms | min | max | tested | blended | goal, tested | share of the limit |"
+        )?;
+        writeln!(text, "|--:|---|{}", "--:|".repeat(7))?;
+        for row in &self.rows {
+            let threads = row.threads;
+            if let Some(Spread { median, min, max }) = row.lists {
+                writeln!(
+                    text,
+                    "| {threads} | lists | {median:.2} | {min:.2} | {max:.2} | | | | |"
+                )?;
+            }
+            let goals = limit.goal.map_or([None; 2], |goal| goal.map(Some));
+            let directions = [
+                ("forward", row.forward, goals[0], Some(limit.forward)),
+                ("backward", row.backward, goals[1], limit.backward),
+            ];
+            for (direction, rate, goal, limit) in directions {
+                let Spread { median, min, max } = rate.milliseconds;
+                let tested = 1e-9 * rate.tested_per_second;
+                let blended = 1e-9 * rate.blended_per_second;
+                let goal = goal.map_or(String::new(), |goal| format!("{goal:.1}"));
+                let share = limit.map_or("limit not measured".to_owned(), |limit| {
+                    format!("{:.0} %", 100.0 * tested / limit)
+                });
+                writeln!(
+                    text,
+                    "| {threads} | {direction} | {median:.2} | {min:.2} | {max:.2} | {tested:.2} | {blended:.2} | {goal} | \
+                     {share} |"
+                )?;
+            }
+        }
+        writeln!(
+            text,
+            "\nThe limit is what the arithmetic alone reached on one core of a machine with AVX-512, on a tile of 16 x 16 \
+             pixels with 256 splats in cache: forward {:.1} with AVX-512, {:.1} with AVX2, {:.1} in scalar code with libm; \
+             backward {:.1} with AVX-512.",
+            AVX512.forward,
+            AVX2.forward,
+            BASELINE.forward,
+            AVX512.backward.unwrap_or(f64::NAN)
+        )
+    }
+}
