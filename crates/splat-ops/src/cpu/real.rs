@@ -62,6 +62,7 @@ impl Real for f64 {
     const ZERO: Self = 0.0;
     const ONE: Self = 1.0;
 
+    #[inline(always)]
     fn of(value: f64) -> Self {
         value
     }
@@ -79,6 +80,7 @@ impl Real for f64 {
     fn abs(self) -> Self {
         self.abs()
     }
+    #[inline(always)]
     fn is_finite(self) -> bool {
         self.is_finite()
     }
@@ -114,6 +116,7 @@ impl Real for f32 {
     fn abs(self) -> Self {
         self.abs()
     }
+    #[inline(always)]
     fn is_finite(self) -> bool {
         self.is_finite()
     }
