@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! means, quats, scales ──> project ──> Projected ─┐
-//! SH coefficients, directions ──> spherical_harmonics ──> colours ─┴─> rasterize ──> Rendered
+//! SH coefficients, means, camera centres ──> sh_colors ──> colours ─┴─> rasterize ──> Rendered
 //! ```
 //!
 //! The ops are separate so that anything can be put between them: another colour model, another
@@ -22,10 +22,12 @@
 pub mod backend;
 pub mod settings;
 
+mod activation;
 mod adam;
 mod autodiff;
 mod blur;
 mod check;
+mod composed;
 #[cfg(feature = "cpu")]
 pub mod cpu;
 #[cfg(feature = "cube")]
@@ -33,16 +35,19 @@ mod cube;
 mod error;
 mod project;
 mod rasterize;
+mod sh_colors;
 mod spherical_harmonics;
 mod ssim;
 #[cfg(all(test, feature = "cpu"))]
 mod tests;
 
-pub use adam::{AdamStep, adam_step};
+pub use activation::{Activation, exp, sigmoid};
+pub use adam::{AdamRows, AdamStep, adam_step};
 pub use blur::gaussian_blur;
 pub use error::{ErrorSlot, OpError};
 pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};
 pub use settings::{ImageSize, ProjectSettings, RasterizeSettings};
+pub use sh_colors::sh_colors;
 pub use spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count, spherical_harmonics};
 pub use ssim::{SsimArgs, ssim_map};

@@ -2,9 +2,12 @@
 //! flows. A tracked op has N parents and one output; only gradients of tracked parents are asked
 //! of the backend.
 
+mod activation;
 mod blur;
 mod project;
 mod rasterize;
+mod screen_probe;
+mod sh_colors;
 mod spherical_harmonics;
 mod ssim;
 
@@ -13,8 +16,9 @@ use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::{Autodiff, AutodiffBackend, tensor::FloatTensor};
 
+use crate::activation::Activation;
 use crate::adam::AdamStep;
-use crate::backend::{AdamTensors, Background, SplatBackend, SplatOps};
+use crate::backend::{AdamTensors, Optional, SplatBackend, SplatOps};
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
 
@@ -38,11 +42,29 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
         spherical_harmonics::spherical_harmonics::<B, C>([coeffs, dirs], degree)
     }
 
+    fn sh_colors(
+        sh0: FloatTensor<Self>,
+        sh_rest: Optional<Self>,
+        means: FloatTensor<Self>,
+        centers: FloatTensor<Self>,
+        degree: usize,
+    ) -> FloatTensor<Self> {
+        sh_colors::sh_colors::<B, C>(sh0, sh_rest.into_option(), means, centers, degree)
+    }
+
+    fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self> {
+        activation::activation::<B, C>(x, function)
+    }
+
+    fn screen_probe(packed: FloatTensor<Self>, probe: FloatTensor<Self>) -> FloatTensor<Self> {
+        screen_probe::screen_probe::<B, C>(packed, probe)
+    }
+
     fn rasterize(
         packed: FloatTensor<Self>,
         colors: FloatTensor<Self>,
         opacities: FloatTensor<Self>,
-        background: Background<Self>,
+        background: Optional<Self>,
         args: RasterizeArgs,
     ) -> FloatTensor<Self> {
         rasterize::rasterize::<B, C>([packed, colors, opacities], background, args)

@@ -3,6 +3,7 @@
 //! Parallel over Gaussians or rows of tiles with rayon, and deterministic: whatever is summed across
 //! threads is summed in a fixed order, so the same input gives the same bits on any number of threads.
 
+mod activation;
 mod adam;
 mod blur;
 pub(crate) mod buffer;
@@ -13,6 +14,7 @@ pub(crate) mod poison;
 mod project;
 mod rasterize;
 pub(crate) mod real;
+mod sh_colors;
 mod simd;
 mod spherical_harmonics;
 mod ssim;
@@ -21,8 +23,10 @@ use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use burn::tensor::DType;
 
+use crate::activation::Activation;
 use crate::adam::AdamStep;
-use crate::backend::SplatBackend;
+use crate::backend::{ShInputs, SplatBackend};
+use crate::composed;
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
 
@@ -99,6 +103,38 @@ impl SplatBackend for Flex {
             degree,
             wanted
         )
+    }
+
+    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> FlexTensor {
+        in_precision!(inputs.means, sh_colors::forward, inputs, degree)
+    }
+
+    fn sh_colors_backward(
+        inputs: ShInputs<Self>,
+        grad: FlexTensor,
+        degree: usize,
+        wanted: [bool; 4],
+    ) -> [Option<FlexTensor>; 4] {
+        in_precision!(grad, sh_colors::backward, inputs, grad, degree, wanted)
+    }
+
+    fn activate(x: FlexTensor, function: Activation) -> FlexTensor {
+        match x.dtype() {
+            DType::F32 | DType::F64 => in_precision!(x, activation::forward, x, function),
+            _ => composed::activate::<Self>(x, function),
+        }
+    }
+
+    fn activate_backward(
+        x: FlexTensor,
+        y: FlexTensor,
+        grad: FlexTensor,
+        function: Activation,
+    ) -> FlexTensor {
+        match x.dtype() {
+            DType::F32 | DType::F64 => in_precision!(x, activation::backward, x, y, grad, function),
+            _ => composed::activate_backward::<Self>(x, y, grad, function),
+        }
     }
 
     fn rasterize_forward(

@@ -45,6 +45,9 @@ pub(crate) trait Real:
     /// fused products and sums, for code that is compiled for a processor which has them.
     fn exp_neg<const FMA: bool>(sigma: Self) -> Self;
 
+    /// `exp(x)`, to 2 units in the last place.
+    fn exp<const FMA: bool>(x: Self) -> Self;
+
     /// The lesser one; the second if the first is NaN.
     #[inline(always)]
     fn least(self, other: Self) -> Self {
@@ -92,6 +95,10 @@ impl Real for f64 {
     fn exp_neg<const FMA: bool>(sigma: Self) -> Self {
         (-sigma).exp()
     }
+    #[inline(always)]
+    fn exp<const FMA: bool>(x: Self) -> Self {
+        x.exp()
+    }
 }
 
 impl Real for f32 {
@@ -128,6 +135,10 @@ impl Real for f32 {
     fn exp_neg<const FMA: bool>(sigma: Self) -> Self {
         exp_neg_f32::<FMA>(sigma)
     }
+    #[inline(always)]
+    fn exp<const FMA: bool>(x: Self) -> Self {
+        exp_f32::<FMA>(x)
+    }
 }
 
 /// Coefficients from degree 5 down, those of the kernels too (`splat_kernels::exp`): the polynomial
@@ -146,14 +157,34 @@ const EXP: [f32; 6] = [
 /// below 2e-7 (see the test), fused or not.
 #[inline(always)]
 fn exp_neg_f32<const FMA: bool>(sigma: f32) -> f32 {
-    // 1.5 * 2^23: adding it rounds to the nearest integer and leaves that integer in the low bits.
-    const ROUND: f32 = 12_582_912.0;
+    let (p, n) = exp_parts::<FMA>(-(sigma.least(80.0)));
+    p * two_to(n)
+}
+
+/// `exp(x)` for any x, in the same way: infinite and zero where that is out of range, NaN for NaN.
+#[inline(always)]
+fn exp_f32<const FMA: bool>(x: f32) -> f32 {
+    // Beyond these the result is infinite or zero anyway. Written so that NaN passes both.
+    let low = if x < -104.0 { -104.0 } else { x };
+    let inside = if low > 89.0 { 89.0 } else { low };
+    let (p, n) = exp_parts::<FMA>(inside);
+    // n may be 128, or -150: neither is the exponent of a normal number, but those of its halves are.
+    let n = n.wrapping_sub(ROUND.to_bits());
+    let half = ((n as i32) >> 1) as u32;
+    p * two_to(half) * two_to(n.wrapping_sub(half))
+}
+
+/// 1.5 * 2^23: adding it rounds to the nearest integer and leaves that integer in the low bits.
+const ROUND: f32 = 12_582_912.0;
+
+/// `e^r` of `e^x = 2^n e^r`, and bits of which the low ones are n.
+#[inline(always)]
+fn exp_parts<const FMA: bool>(x: f32) -> (f32, u32) {
     // ln(2) in two parts; the first has so few bits that n * LN2_HIGH is exact.
     const LN2_HIGH: f32 = 0.693_359_4;
     const LN2_LOW: f32 = -2.121_944_4e-4;
     let multiply_add = f32::multiply_add::<FMA>;
 
-    let x = -(sigma.least(80.0));
     let shifted = multiply_add(x, core::f32::consts::LOG2_E, ROUND);
     let n = shifted - ROUND;
     let r = multiply_add(-n, LN2_LOW, multiply_add(-n, LN2_HIGH, x));
@@ -161,9 +192,13 @@ fn exp_neg_f32<const FMA: bool>(sigma: f32) -> f32 {
     for coefficient in &EXP[1..] {
         p = multiply_add(p, r, *coefficient);
     }
-    // The low bits of `shifted` are n; moved into the exponent they make 2^n.
-    let two_to_n = f32::from_bits((shifted.to_bits() << 23).wrapping_add(1.0f32.to_bits()));
-    p * two_to_n
+    (p, shifted.to_bits())
+}
+
+/// `2^n` of a small n in the low bits: moved into the exponent.
+#[inline(always)]
+fn two_to(n: u32) -> f32 {
+    f32::from_bits((n << 23).wrapping_add(1.0f32.to_bits()))
 }
 
 #[cfg(test)]
@@ -182,6 +217,44 @@ mod tests {
         assert!(f32::exp_neg::<FMA>(1e9) < 1e-30);
         assert!(f32::exp_neg::<FMA>(f32::NAN) < 1e-30);
         assert_eq!(f32::exp_neg::<FMA>(0.0), 1.0);
+    }
+
+    fn check_anywhere<const FMA: bool>() {
+        let mut worst = 0.0f64;
+        for i in -8_700_000..=8_870_000 {
+            let x = i as f32 * 1e-5;
+            let exact = f64::from(x).exp();
+            worst = worst.max((f64::from(<f32 as Real>::exp::<FMA>(x)) / exact - 1.0).abs());
+        }
+        println!("fused: {FMA}, worst relative error {worst:e}");
+        assert!(worst < 2e-7, "worst relative error {worst:e}");
+        // Numbers below the normal ones have fewer digits, and then none.
+        for x in [
+            -88.0f32,
+            -95.0,
+            -103.0,
+            -103.9,
+            -105.0,
+            -1e30,
+            f32::NEG_INFINITY,
+        ] {
+            let error = f64::from(<f32 as Real>::exp::<FMA>(x)) - f64::from(x).exp();
+            assert!(
+                error.abs() <= 1.5 * f64::from(f32::from_bits(1)),
+                "{x}: {error:e}"
+            );
+        }
+        assert_eq!(<f32 as Real>::exp::<FMA>(0.0), 1.0);
+        for x in [88.73, 89.0, 1e30, f32::INFINITY] {
+            assert_eq!(<f32 as Real>::exp::<FMA>(x), f32::INFINITY, "{x}");
+        }
+        assert!(<f32 as Real>::exp::<FMA>(f32::NAN).is_nan());
+    }
+
+    #[test]
+    fn exp_is_exact_to_two_ulp_anywhere() {
+        check_anywhere::<true>();
+        check_anywhere::<false>();
     }
 
     #[test]

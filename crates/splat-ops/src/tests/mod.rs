@@ -1,7 +1,10 @@
 //! What must hold on every backend: the native path, and the kernels where there is an adapter.
 
+mod activation;
 mod decisions;
 mod poison;
+mod probe;
+mod sh_colors;
 
 use burn::tensor::Device;
 

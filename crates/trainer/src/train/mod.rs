@@ -459,7 +459,8 @@ impl Trainer {
             .config
             .rates
             .at(step, self.config.steps, self.run.scene_scale);
-        let gaussians = self.gaussians.clone();
+        // Out of its place: the optimiser writes into memory that nothing else holds, and copies the rest.
+        let gaussians = std::mem::replace(&mut self.gaussians, Gaussians::empty(&self.device));
         self.gaussians = self.state.optimizer.step(rates, gaussians, grads);
 
         let mut values = vec![loss.inner()];
