@@ -192,6 +192,15 @@ pub trait SplatBackend: Backend {
         ]
     }
 
+    /// [`ScreenStatistics::add`](crate::ScreenStatistics::add): gradient and extents `[C, N, 2]` and both sums `[N]` to the
+    /// sums with the lengths of `half * gradient` and the views added. Composed of tensor ops unless a backend knows better.
+    fn add_screen_statistics(
+        tensors: [FloatTensor<Self>; 4],
+        half: [f64; 2],
+    ) -> [FloatTensor<Self>; 2] {
+        composed::screen_statistics::<Self>(tensors, half)
+    }
+
     /// Parameter, gradient and both moments to parameter and moments after
     /// [`adam_step`](crate::adam_step). Composed of tensor ops unless a backend knows better.
     fn adam(tensors: [FloatTensor<Self>; 4], step: &AdamStep) -> [FloatTensor<Self>; 3] {
@@ -262,6 +271,13 @@ pub(crate) struct AdamTensors<B: Backend> {
     pub(crate) moment_2: FloatTensor<B>,
 }
 
+/// Sums of screen gradients and of views, in the form in which Burn's dispatch can carry them.
+#[derive(ExtensionType)]
+pub(crate) struct StatisticsTensors<B: Backend> {
+    pub(crate) gradients: FloatTensor<B>,
+    pub(crate) views: FloatTensor<B>,
+}
+
 /// An optional tensor, in the form in which Burn's dispatch can carry one.
 #[derive(ExtensionType)]
 pub(crate) enum Optional<B: Backend> {
@@ -327,6 +343,14 @@ pub(crate) trait SplatOps: Backend {
         moment_2: FloatTensor<Self>,
         step: AdamStep,
     ) -> AdamTensors<Self>;
+
+    fn screen_statistics(
+        gradient: FloatTensor<Self>,
+        extents: FloatTensor<Self>,
+        gradients: FloatTensor<Self>,
+        views: FloatTensor<Self>,
+        half: [f64; 2],
+    ) -> StatisticsTensors<Self>;
 }
 
 /// Without autodiff an op is its forward, and nothing is kept.
@@ -416,6 +440,18 @@ macro_rules! forward_only {
                     moment_1,
                     moment_2,
                 }
+            }
+
+            fn screen_statistics(
+                gradient: FloatTensor<Self>,
+                extents: FloatTensor<Self>,
+                gradients: FloatTensor<Self>,
+                views: FloatTensor<Self>,
+                half: [f64; 2],
+            ) -> StatisticsTensors<Self> {
+                let tensors = [gradient, extents, gradients, views];
+                let [gradients, views] = Self::add_screen_statistics(tensors, half);
+                StatisticsTensors { gradients, views }
             }
         }
     };

@@ -18,7 +18,7 @@ use burn::backend::{Autodiff, AutodiffBackend, tensor::FloatTensor};
 
 use crate::activation::Activation;
 use crate::adam::AdamStep;
-use crate::backend::{AdamTensors, Optional, SplatBackend, SplatOps};
+use crate::backend::{AdamTensors, Optional, SplatBackend, SplatOps, StatisticsTensors};
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
 
@@ -93,6 +93,18 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
             moment_1,
             moment_2,
         }
+    }
+
+    fn screen_statistics(
+        gradient: FloatTensor<Self>,
+        extents: FloatTensor<Self>,
+        gradients: FloatTensor<Self>,
+        views: FloatTensor<Self>,
+        half: [f64; 2],
+    ) -> StatisticsTensors<Self> {
+        let tensors = [gradient, extents, gradients, views].map(|tensor| tensor.into_primitive());
+        let [gradients, views] = B::add_screen_statistics(tensors, half).map(Self::from_inner);
+        StatisticsTensors { gradients, views }
     }
 }
 

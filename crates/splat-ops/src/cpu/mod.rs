@@ -14,6 +14,7 @@ pub(crate) mod poison;
 mod project;
 mod rasterize;
 pub(crate) mod real;
+mod screen_statistics;
 mod sh_colors;
 mod simd;
 mod spherical_harmonics;
@@ -200,6 +201,10 @@ impl SplatBackend for Flex {
             args,
             wanted
         )
+    }
+
+    fn add_screen_statistics(tensors: [FlexTensor; 4], half: [f64; 2]) -> [FlexTensor; 2] {
+        in_precision!(tensors[0], screen_statistics::add, tensors, half)
     }
 
     fn adam(tensors: [FlexTensor; 4], step: &AdamStep) -> [FlexTensor; 3] {

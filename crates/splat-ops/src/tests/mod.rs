@@ -4,6 +4,7 @@ mod activation;
 mod decisions;
 mod poison;
 mod probe;
+mod screen_statistics;
 mod sh_colors;
 
 use burn::tensor::Device;

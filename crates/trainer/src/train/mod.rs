@@ -472,7 +472,8 @@ impl Trainer {
         });
         self.state.step += 1;
         if let Some(gradient) = screen_gradient {
-            self.state.density.observe(gradient, extents, cameras.size);
+            let density = &mut self.state.density;
+            density.observe(gradient, extents, cameras.size)?;
         }
         // What would be added after the last step would never be trained.
         if self.state.step < self.config.steps {
