@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 
 use burn::optim::{LearningRate, Optimizer, RecordState, StateSink, StateSource};
 use burn::tensor::{Device, Int, Tensor};
-use splat_ops::{AdamStep, adam_step};
+use splat_ops::{AdamRows, AdamStep, adam_step};
 
 /// What happened to the rows of a parameter.
 #[derive(Debug, Clone)]
@@ -96,16 +96,19 @@ pub struct SplatAdam {
     pub beta_2: f64,
     /// Added to the root of the second moment.
     pub epsilon: f64,
+    /// Which rows take a step. [`AdamRows::Seen`] is another optimiser with other results: measure before relying on it.
+    pub rows: AdamRows,
     edits: EditLog,
 }
 
 impl SplatAdam {
-    /// The settings of 3DGS: betas 0.9 and 0.999, epsilon 1e-15.
+    /// The settings of 3DGS: betas 0.9 and 0.999, epsilon 1e-15, all rows.
     pub fn new(edits: EditLog) -> Self {
         Self {
             beta_1: 0.9,
             beta_2: 0.999,
             epsilon: 1e-15,
+            rows: AdamRows::All,
             edits,
         }
     }
@@ -197,6 +200,7 @@ impl Optimizer for SplatAdam {
             beta_2: self.beta_2,
             rate: lr * correction_2 / correction_1,
             epsilon: self.epsilon * correction_2,
+            rows: self.rows,
         };
         let moments = [state.moment_1, state.moment_2];
         let (tensor, [moment_1, moment_2]) = adam_step(tensor, grad, moments, &step).expect(
@@ -246,6 +250,43 @@ mod tests {
         }
         for (a, b) in values(a).into_iter().zip(values(b)) {
             assert!((a - b).abs() <= 1e-6 * b.abs().max(1.0), "{a} {b}");
+        }
+    }
+
+    /// Rows that a step has not seen are as if it had not been, but for the count of steps; the others are as ever.
+    #[test]
+    fn of_seen_rows_only_the_others_keep_everything() {
+        let device = Device::flex();
+        let mut adam = SplatAdam::new(EditLog::default());
+        adam.rows = AdamRows::Seen;
+        let all = SplatAdam::new(EditLog::default());
+        let start = Tensor::<2>::from_floats([[1.0, -2.0], [0.5, 3.0], [0.0, 0.1]], &device);
+        let (first, state) = adam.step(0.01, start.clone(), gradient(0, &device), None);
+        let (same, _) = all.step(0.01, start, gradient(0, &device), None);
+        assert_eq!(values(first.clone()), values(same));
+
+        let moments = |state: &Option<SplatAdamState<2>>| {
+            let state = state.clone().unwrap();
+            [values(state.moment_1), values(state.moment_2)]
+        };
+        let before = (values(first.clone()), moments(&state));
+        // Nothing, one element of two, and nothing but a NaN.
+        let gradient = Tensor::from_floats([[0.0, 0.0], [0.0, 0.3], [0.0, f32::NAN]], &device);
+        let (seen, seen_state) = adam.step(0.01, first.clone(), gradient.clone(), state.clone());
+        let (every, every_state) = all.step(0.01, first, gradient, state);
+        let seen = (values(seen), moments(&seen_state));
+        let every = (values(every), moments(&every_state));
+        let columns =
+            |of: &(Vec<f32>, [Vec<f32>; 2])| [of.0.clone(), of.1[0].clone(), of.1[1].clone()];
+        for ((seen, before), every) in columns(&seen)
+            .iter()
+            .zip(columns(&before))
+            .zip(columns(&every))
+        {
+            assert_eq!(seen[..2], before[..2]);
+            assert_eq!(seen[2..4], every[2..4]);
+            assert_eq!(seen[4..], before[4..]);
+            assert_ne!(every[..2], before[..2]);
         }
     }
 

@@ -58,12 +58,12 @@ pub struct CameraTensors {
 }
 
 impl CameraTensors {
-    /// Camera centres `[C, 1, 3]`: `-W^T t` for `viewmat = [W | t]`. Differentiable.
-    pub fn centers(&self) -> Tensor<3> {
+    /// Camera centres `[C, 3]`: `-W^T t` for `viewmat = [W | t]`. Differentiable.
+    pub fn centers(&self) -> Tensor<2> {
         let upper = self.viewmats.clone().narrow(1, 0, 3);
         let rotation = upper.clone().narrow(2, 0, 3);
         let translation = upper.narrow(2, 3, 1);
-        (rotation * translation).sum_dim(1).neg()
+        (rotation * translation).sum_dim(1).squeeze_dim(1).neg()
     }
 }
 

@@ -1,8 +1,8 @@
 //! The model: a set of 3D Gaussians as a Burn module (3DGS section 4).
 
 use burn::module::{Module, Param};
-use burn::tensor::{Device, Tensor, TensorData, activation};
-use splat_ops::{SH_DEGREE_MAX, sh_coefficient_count};
+use burn::tensor::{Device, Tensor, TensorData};
+use splat_ops::{OpError, SH_DEGREE_MAX, exp, sh_coefficient_count, sh_colors, sigmoid};
 
 use crate::files::SplatData;
 
@@ -29,6 +29,11 @@ pub struct Gaussians {
 }
 
 impl Gaussians {
+    /// None at all.
+    pub fn empty(device: &Device) -> Self {
+        Self::from_data(&SplatData::default(), device)
+    }
+
     /// Puts the values of a scene on a device.
     pub fn from_data(data: &SplatData, device: &Device) -> Self {
         let n = data.means.len();
@@ -99,7 +104,7 @@ impl Gaussians {
 
     /// Linear scales `[N, 3]`.
     pub fn scales(&self) -> Tensor<2> {
-        self.log_scales.val().exp()
+        exp(self.log_scales.val())
     }
 
     /// Opacities in (0, 1), `[N]`.
@@ -107,32 +112,19 @@ impl Gaussians {
         sigmoid(self.opacity_logits.val())
     }
 
-    /// Coefficients `[N, (degree + 1)^2, 3]`, up to a degree that the model has.
-    pub fn sh_coefficients(&self, degree: usize) -> Tensor<3> {
-        let count = sh_coefficient_count(degree) - 1;
-        match &self.sh_rest {
-            Some(rest) if count > 0 => {
-                let mut rest = rest.val();
-                // All of them: no slice, whose gradient would be padded with zeros.
-                if count < rest.dims()[1] {
-                    rest = rest.narrow(1, 0, count);
-                }
-                Tensor::cat(vec![self.sh0.val(), rest], 1)
-            }
-            _ => self.sh0.val(),
-        }
+    /// Colours `[C, N, 3]` as cameras with the given centres `[C, 3]` see them, with spherical harmonics up to `degree`.
+    ///
+    /// # Errors
+    /// When the model has no coefficients of that degree, or the centres do not fit.
+    pub fn colors(&self, centers: Tensor<2>, degree: usize) -> Result<Tensor<3>, OpError> {
+        sh_colors(
+            self.sh0.val(),
+            self.sh_rest.as_ref().map(|rest| rest.val()),
+            self.means.val(),
+            centers,
+            degree,
+        )
     }
-}
-
-/// The logistic function as `exp(min(x, 0)) / (1 + exp(-|x|))`. Burn's own differentiates it as `o (1 - o)`, which is
-/// exactly zero once o rounds to one (from a logit of 17 on in single precision): a Gaussian could never become
-/// transparent again. Differentiated term by term this form keeps every digit at both ends. The two halves of x split
-/// so that exactly one of them has a derivative, at zero too.
-fn sigmoid(x: Tensor<1>) -> Tensor<1> {
-    let negative = x.clone().clamp_max(0.0);
-    let positive = activation::relu(x);
-    let small = (negative.clone() - positive).exp();
-    negative.exp() / small.add_scalar(1.0)
 }
 
 /// A float tensor's values on the host.
@@ -146,28 +138,4 @@ pub(crate) fn host<const R: usize>(tensor: Tensor<R>) -> Vec<f32> {
 
 fn rows<const W: usize>(tensor: Tensor<2>) -> Vec<[f32; W]> {
     host(tensor).as_chunks().0.to_vec()
-}
-
-#[cfg(all(test, feature = "cpu"))]
-mod tests {
-    use super::*;
-
-    /// At both ends, at the bend, and between: opacity and its gradient to a few ulp of `1 / (1 + exp(-x))` in double
-    /// precision. Below a logit of -87 the opacity itself leaves the range of normal floats.
-    #[test]
-    fn opacities_and_their_gradients_keep_their_digits() {
-        let logits = [-80.0, -30.0, -5.0, -0.1, 0.0, 0.1, 5.0, 17.0, 30.0, 80.0f32];
-        let device = Device::flex().autodiff();
-        let x = Tensor::<1>::from_data(TensorData::from(logits), &device).require_grad();
-        let opacities = sigmoid(x.clone());
-        let gradient = x.grad(&opacities.clone().sum().backward()).unwrap();
-        let (opacities, gradient) = (host(opacities), host(gradient));
-        for (i, x) in logits.into_iter().map(f64::from).enumerate() {
-            let opacity = 1.0 / (1.0 + (-x).exp());
-            let slope = 1.0 / ((1.0 + (-x).exp()) * (1.0 + x.exp()));
-            let error = |got: f32, want: f64| (f64::from(got) / want - 1.0).abs();
-            assert!(error(opacities[i], opacity) < 1e-6, "opacity at {x}");
-            assert!(error(gradient[i], slope) < 1e-6, "gradient at {x}");
-        }
-    }
 }

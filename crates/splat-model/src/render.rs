@@ -3,7 +3,6 @@
 use burn::tensor::Tensor;
 use splat_ops::{
     OpError, ProjectSettings, Projected, RasterizeSettings, Rendered, project, rasterize,
-    spherical_harmonics,
 };
 
 use crate::{CameraTensors, Gaussians};
@@ -60,7 +59,7 @@ pub fn project_gaussians(
 /// probe, a researcher whatever is being researched.
 ///
 /// # Errors
-/// See [`spherical_harmonics`] and [`rasterize`].
+/// See [`sh_colors`](splat_ops::sh_colors) and [`rasterize`].
 pub fn render_projected(
     gaussians: &Gaussians,
     projected: &Projected,
@@ -68,17 +67,13 @@ pub fn render_projected(
     settings: &RenderSettings,
 ) -> Result<Rendered, OpError> {
     let degree = settings.sh_degree.min(gaussians.sh_degree());
-    let [_, n, _] = projected.packed().dims();
-    // `-1` and repeats instead of broadcasts, because N may be 0.
-    let means = gaussians.means.val().reshape([1, -1, 3]);
-    let dirs = means - cameras.centers().repeat_dim(1, n);
-    let colors = spherical_harmonics(gaussians.sh_coefficients(degree), dirs, degree)?;
-    let colors = (colors + 0.5).clamp_min(0.0);
+    let colors = gaussians.colors(cameras.centers(), degree)?;
     let [count, _, _] = colors.dims();
     let background = settings.background.map(|color| {
         let color = Tensor::<1>::from_floats(color, &colors.device());
         color.reshape([1, 3]).repeat_dim(0, count)
     });
+    // `-1` and a repeat instead of a broadcast, because N may be 0.
     let mut opacities = gaussians.opacities().reshape([1, -1]).repeat_dim(0, count);
     if settings.antialias {
         opacities = opacities * projected.compensations();

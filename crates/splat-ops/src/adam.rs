@@ -18,11 +18,26 @@ pub struct AdamStep {
     pub rate: f64,
     /// Added to the root of the second moment; epsilon times `sqrt(1 - beta_2^t)`.
     pub epsilon: f64,
+    /// Which rows take the step.
+    pub rows: AdamRows,
+}
+
+/// Which rows of a parameter, along its first dimension, a step changes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum AdamRows {
+    /// All, as Adam is defined: where the gradient is zero, moments decay and parameters drift on.
+    #[default]
+    All,
+    /// Those whose gradient is not all zero; the others keep parameter and moments, as if the step had not been for
+    /// them (the sparse Adam of Mallick et al. 2024, *Taming 3DGS*; `SelectiveAdam` of gsplat). Another optimiser with
+    /// other results, and faster where most Gaussians are out of view.
+    Seen,
 }
 
 /// Steps a parameter and its two moments, all of one shape:
 /// `m = beta_1 m + (1 - beta_1) g`, `v = beta_2 v + (1 - beta_2) g^2`,
-/// `p = p - rate m / (sqrt(v) + epsilon)`. One pass over memory on the CPU. Not differentiable.
+/// `p = p - rate m / (sqrt(v) + epsilon)`. Not differentiable. On the CPU one pass over memory, in place where nothing
+/// else holds the tensors.
 ///
 /// A gradient whose square is not finite counts as zero: one NaN would stay in the moments for good.
 ///

@@ -11,7 +11,8 @@ use burn::backend::{
 #[allow(unused_imports)]
 use burn::backend::{Autodiff, Dispatch};
 
-use crate::adam::AdamStep;
+use crate::activation::Activation;
+use crate::adam::{AdamRows, AdamStep};
 use crate::composed;
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
@@ -67,6 +68,39 @@ pub trait SplatBackend: Backend {
         degree: usize,
         wanted: [bool; 2],
     ) -> [Option<FloatTensor<Self>>; 2];
+
+    /// [`sh_colors`](crate::sh_colors): `[N, 1, 3]`, `[N, R, 3]`, means `[N, 3]` and centres `[C, 3]` to `[C, N, 3]`. There
+    /// are higher coefficients exactly when the degree is above 0. Composed of the op above and tensor ops unless a backend
+    /// knows better.
+    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> FloatTensor<Self> {
+        composed::sh_colors(inputs, degree)
+    }
+
+    /// Gradients of the four inputs, given the gradient `[C, N, 3]` of the colours.
+    fn sh_colors_backward(
+        inputs: ShInputs<Self>,
+        grad: FloatTensor<Self>,
+        degree: usize,
+        wanted: [bool; 4],
+    ) -> [Option<FloatTensor<Self>>; 4] {
+        composed::sh_colors_backward(inputs, grad, degree, wanted)
+    }
+
+    /// [`exp`](crate::exp) or [`sigmoid`](crate::sigmoid) of every element. Composed of tensor ops unless a backend knows
+    /// better.
+    fn activate(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self> {
+        composed::activate::<Self>(x, function)
+    }
+
+    /// Gradient of the input, given the input, the output and the output's gradient.
+    fn activate_backward(
+        x: FloatTensor<Self>,
+        y: FloatTensor<Self>,
+        grad: FloatTensor<Self>,
+        function: Activation,
+    ) -> FloatTensor<Self> {
+        composed::activate_backward::<Self>(x, y, grad, function)
+    }
 
     /// Packed splats `[C, N, 9]`, colours `[C, N, D]`, opacities `[C, N]` and background `[C, D]`
     /// to `[C, H, W, D + 1]`, the last channel being alpha.
@@ -146,9 +180,20 @@ pub trait SplatBackend: Backend {
         composed::photometric_backward::<Self>(rendered, target, slope, grad)
     }
 
+    /// [`ScreenStatistics::add`](crate::ScreenStatistics::add): gradient and extents `[C, N, 2]` and both sums `[N]` to the
+    /// sums with the lengths of `half * gradient` and the views added. Composed of tensor ops unless a backend knows better.
+    fn add_screen_statistics(
+        tensors: [FloatTensor<Self>; 4],
+        half: [f64; 2],
+    ) -> [FloatTensor<Self>; 2] {
+        composed::screen_statistics::<Self>(tensors, half)
+    }
+
     /// Parameter, gradient and both moments to parameter and moments after
     /// [`adam_step`](crate::adam_step). Composed of tensor ops unless a backend knows better.
     fn adam(tensors: [FloatTensor<Self>; 4], step: &AdamStep) -> [FloatTensor<Self>; 3] {
+        let before = [0, 2, 3].map(|i| tensors[i].clone());
+        let grad_before = tensors[1].clone();
         let [param, grad, moment_1, moment_2] = tensors;
         let decay = |moment, beta: f64, fresh| {
             Self::float_add(
@@ -168,8 +213,25 @@ pub trait SplatBackend: Backend {
         let root = Self::float_add_scalar(root, step.epsilon.into());
         let delta = Self::float_div(moment_1.clone(), root);
         let delta = Self::float_mul_scalar(delta, step.rate.into());
-        [Self::float_sub(param, delta), moment_1, moment_2]
+        let after = [Self::float_sub(param, delta), moment_1, moment_2];
+        match step.rows {
+            AdamRows::All => after,
+            AdamRows::Seen => composed::where_seen::<Self>(grad_before, before, after),
+        }
     }
+}
+
+/// What [`sh_colors`](crate::sh_colors) takes.
+#[derive(Debug, Clone)]
+pub struct ShInputs<B: Backend> {
+    /// `[N, 1, 3]`.
+    pub sh0: FloatTensor<B>,
+    /// `[N, R, 3]`; absent at degree 0.
+    pub sh_rest: Option<FloatTensor<B>>,
+    /// `[N, 3]`.
+    pub means: FloatTensor<B>,
+    /// `[C, 3]`.
+    pub centers: FloatTensor<B>,
 }
 
 /// A parameter and its moments, in the form in which Burn's dispatch can carry them.
@@ -180,13 +242,27 @@ pub(crate) struct AdamTensors<B: Backend> {
     pub(crate) moment_2: FloatTensor<B>,
 }
 
+/// Sums of screen gradients and of views, in the form in which Burn's dispatch can carry them.
+#[derive(ExtensionType)]
+pub(crate) struct StatisticsTensors<B: Backend> {
+    pub(crate) gradients: FloatTensor<B>,
+    pub(crate) views: FloatTensor<B>,
+}
+
 /// An optional tensor, in the form in which Burn's dispatch can carry one.
 #[derive(ExtensionType)]
-pub(crate) enum Background<B: Backend> {
-    /// `[C, D]`.
-    Color(FloatTensor<B>),
-    /// Nothing lies behind the splats.
+pub(crate) enum Optional<B: Backend> {
+    Some(FloatTensor<B>),
     None,
+}
+
+impl<B: Backend> Optional<B> {
+    pub(crate) fn into_option(self) -> Option<FloatTensor<B>> {
+        match self {
+            Self::Some(tensor) => Some(tensor),
+            Self::None => None,
+        }
+    }
 }
 
 /// What [`photometric`](crate::photometric) compares with, `[B, H, W, D]`, in the form in which Burn's dispatch can
@@ -217,11 +293,23 @@ pub(crate) trait SplatOps: Backend {
         degree: usize,
     ) -> FloatTensor<Self>;
 
+    fn sh_colors(
+        sh0: FloatTensor<Self>,
+        #[extension_type] sh_rest: Optional<Self>,
+        means: FloatTensor<Self>,
+        centers: FloatTensor<Self>,
+        degree: usize,
+    ) -> FloatTensor<Self>;
+
+    fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self>;
+
+    fn screen_probe(packed: FloatTensor<Self>, probe: FloatTensor<Self>) -> FloatTensor<Self>;
+
     fn rasterize(
         packed: FloatTensor<Self>,
         colors: FloatTensor<Self>,
         opacities: FloatTensor<Self>,
-        #[extension_type] background: Background<Self>,
+        #[extension_type] background: Optional<Self>,
         args: RasterizeArgs,
     ) -> FloatTensor<Self>;
 
@@ -242,6 +330,14 @@ pub(crate) trait SplatOps: Backend {
         moment_2: FloatTensor<Self>,
         step: AdamStep,
     ) -> AdamTensors<Self>;
+
+    fn screen_statistics(
+        gradient: FloatTensor<Self>,
+        extents: FloatTensor<Self>,
+        gradients: FloatTensor<Self>,
+        views: FloatTensor<Self>,
+        half: [f64; 2],
+    ) -> StatisticsTensors<Self>;
 }
 
 /// Without autodiff an op is its forward, and nothing is kept.
@@ -267,18 +363,42 @@ macro_rules! forward_only {
                 Self::spherical_harmonics_forward(coeffs, dirs, degree)
             }
 
+            fn sh_colors(
+                sh0: FloatTensor<Self>,
+                sh_rest: Optional<Self>,
+                means: FloatTensor<Self>,
+                centers: FloatTensor<Self>,
+                degree: usize,
+            ) -> FloatTensor<Self> {
+                let inputs = ShInputs {
+                    sh0,
+                    sh_rest: sh_rest.into_option(),
+                    means,
+                    centers,
+                };
+                Self::sh_colors_forward(inputs, degree)
+            }
+
+            fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self> {
+                Self::activate(x, function)
+            }
+
+            fn screen_probe(
+                packed: FloatTensor<Self>,
+                _probe: FloatTensor<Self>,
+            ) -> FloatTensor<Self> {
+                packed
+            }
+
             fn rasterize(
                 packed: FloatTensor<Self>,
                 colors: FloatTensor<Self>,
                 opacities: FloatTensor<Self>,
-                background: Background<Self>,
+                background: Optional<Self>,
                 args: RasterizeArgs,
             ) -> FloatTensor<Self> {
-                let background = match background {
-                    Background::Color(color) => Some(color),
-                    Background::None => None,
-                };
-                Self::rasterize_forward(packed, colors, opacities, background, &args).0
+                Self::rasterize_forward(packed, colors, opacities, background.into_option(), &args)
+                    .0
             }
 
             fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self> {
@@ -315,6 +435,18 @@ macro_rules! forward_only {
                     moment_1,
                     moment_2,
                 }
+            }
+
+            fn screen_statistics(
+                gradient: FloatTensor<Self>,
+                extents: FloatTensor<Self>,
+                gradients: FloatTensor<Self>,
+                views: FloatTensor<Self>,
+                half: [f64; 2],
+            ) -> StatisticsTensors<Self> {
+                let tensors = [gradient, extents, gradients, views];
+                let [gradients, views] = Self::add_screen_statistics(tensors, half);
+                StatisticsTensors { gradients, views }
             }
         }
     };

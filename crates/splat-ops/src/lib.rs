@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! means, quats, scales ──> project ──> Projected ─┐
-//! SH coefficients, directions ──> spherical_harmonics ──> colours ─┴─> rasterize ──> Rendered
+//! SH coefficients, means, camera centres ──> sh_colors ──> colours ─┴─> rasterize ──> Rendered
 //! ```
 //!
 //! The ops are separate so that anything can be put between them: another colour model, another
@@ -22,6 +22,7 @@
 pub mod backend;
 pub mod settings;
 
+mod activation;
 mod adam;
 mod autodiff;
 mod blur;
@@ -35,12 +36,15 @@ mod error;
 mod photometric;
 mod project;
 mod rasterize;
+mod screen_statistics;
+mod sh_colors;
 mod spherical_harmonics;
 mod ssim;
 #[cfg(all(test, feature = "cpu"))]
 mod tests;
 
-pub use adam::{AdamStep, adam_step};
+pub use activation::{Activation, exp, sigmoid};
+pub use adam::{AdamRows, AdamStep, adam_step};
 pub use blur::gaussian_blur;
 #[cfg(feature = "cpu")]
 pub use cpu::{RasterizeWork, rasterize_work};
@@ -48,6 +52,8 @@ pub use error::{ErrorSlot, OpError};
 pub use photometric::{Photometric, Target, photometric};
 pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};
+pub use screen_statistics::ScreenStatistics;
 pub use settings::{ImageSize, ProjectSettings, RasterizeSettings};
+pub use sh_colors::sh_colors;
 pub use spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count, spherical_harmonics};
 pub use ssim::{SsimArgs, ssim_map};

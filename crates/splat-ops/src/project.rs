@@ -75,8 +75,9 @@ impl Projected {
         self.size
     }
 
-    /// Adds a zero leaf `[C, N, 2]` to the screen means, so that after the backward pass the
-    /// leaf's gradient is that of the screen means (density control reads it; 3DGS section 5.2).
+    /// Ties a leaf `[C, N, 2]` to the screen means, so that after the backward pass the leaf's gradient is that of the
+    /// screen means (density control reads it; 3DGS section 5.2). The leaf's values are not read: the splats stay as
+    /// they are.
     ///
     /// # Errors
     /// When the probe is not `[C, N, 2]`.
@@ -84,12 +85,12 @@ impl Projected {
         let check = Checker::new("Projected", "packed", &self.packed)?;
         let [c, n, _] = self.packed.dims();
         check.tensor("probe", &probe, [Some(c), Some(n), Some(2)], "[C, N, 2]")?;
-        let rest = Tensor::zeros(
-            [c, n, PROJECTED_WIDTH - 2],
-            (&probe.device(), probe.dtype()),
+        let packed = <Dispatch as SplatOps>::screen_probe(
+            self.packed.into_dispatch(),
+            probe.into_dispatch(),
         );
         Ok(Self {
-            packed: self.packed + Tensor::cat(vec![probe, rest], 2),
+            packed: Tensor::from_dispatch(packed),
             size: self.size,
         })
     }

@@ -3,7 +3,7 @@
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 
-use crate::backend::{Background, SplatOps};
+use crate::backend::{Optional, SplatOps};
 use crate::check::Checker;
 use crate::settings::RasterizeArgs;
 use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
@@ -76,8 +76,8 @@ pub fn rasterize<const DC: usize, const DO: usize>(
         colors.into_dispatch(),
         opacities.into_dispatch(),
         match background {
-            Some(color) => Background::Color(color.into_dispatch()),
-            None => Background::None,
+            Some(color) => Optional::Some(color.into_dispatch()),
+            None => Optional::None,
         },
         RasterizeArgs {
             size: projected.image_size(),

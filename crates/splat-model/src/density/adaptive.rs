@@ -6,7 +6,7 @@ use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
-use splat_ops::ImageSize;
+use splat_ops::{ImageSize, OpError, ScreenStatistics};
 
 use super::edit::{RowPlan, apply_plan, clamp_opacities};
 use crate::Gaussians;
@@ -109,7 +109,7 @@ pub struct AdaptiveDensity {
     run: RunShape,
     /// Per Gaussian, sum of screen gradients and number of views that saw it, since the last
     /// refinement.
-    statistics: Option<(Tensor<1>, Tensor<1>)>,
+    statistics: Option<ScreenStatistics>,
 }
 
 impl AdaptiveDensity {
@@ -128,35 +128,40 @@ impl AdaptiveDensity {
     }
 
     /// Takes in a step: gradient of the screen means `[C, N, 2]`, extents `[C, N, 2]`.
-    pub fn observe(&mut self, screen_gradient: Tensor<3>, extents: Tensor<3>, size: ImageSize) {
-        let [cameras, n, _] = screen_gradient.dims();
-        // Pixels to half images, and the mean over cameras to a sum, as gsplat measures it.
-        let half = [size.width, size.height].map(|side| side as f32 / 2.0 * cameras as f32);
-        let half = Tensor::<1>::from_floats(half, &screen_gradient.device()).reshape([1, 1, 2]);
-        let seen = extents.inner().narrow(2, 0, 1).reshape([cameras, n]);
-        let seen = seen.greater_scalar(0.0).float();
-        let length = (screen_gradient * half).square().sum_dim(2).sqrt();
-        let length = length.reshape([cameras, n]) * seen.clone();
-        // What is not finite must not hide the other views of the same Gaussian.
-        let finite = length.clone().lower_equal_scalar(f32::MAX);
-        let length = length.mask_fill(finite.bool_not(), 0.0);
-        let sum = length.sum_dim(0).reshape([n]);
-        let count = seen.sum_dim(0).reshape([n]);
-        self.statistics = Some(match self.statistics.take() {
-            Some((total, views)) if total.dims()[0] == n => (total + sum, views + count),
-            _ => (sum, count),
+    ///
+    /// # Errors
+    /// When they do not fit each other.
+    pub fn observe(
+        &mut self,
+        screen_gradient: Tensor<3>,
+        extents: Tensor<3>,
+        size: ImageSize,
+    ) -> Result<(), OpError> {
+        let [_, n, _] = screen_gradient.dims();
+        let before = self
+            .statistics
+            .take()
+            .filter(|sums| sums.views.dims() == [n]);
+        let before = before.unwrap_or_else(|| {
+            let zeros = Tensor::zeros([n], (&screen_gradient.device(), screen_gradient.dtype()));
+            ScreenStatistics {
+                gradients: zeros.clone(),
+                views: zeros,
+            }
         });
+        self.statistics = Some(before.add(screen_gradient, extents.inner(), size)?);
+        Ok(())
     }
 
     /// Sums of screen gradients and numbers of views per Gaussian so far, on the host, to be saved.
     pub fn statistics(&self) -> Option<(Vec<f32>, Vec<f32>)> {
-        let (gradients, views) = self.statistics.clone()?;
-        Some((host(gradients), host(views)))
+        let sums = self.statistics.clone()?;
+        Some((host(sums.gradients), host(sums.views)))
     }
 
     /// Puts back what [`statistics`](Self::statistics) gave.
     pub fn restore_statistics(&mut self, gradients: Tensor<1>, views: Tensor<1>) {
-        self.statistics = Some((gradients, views));
+        self.statistics = Some(ScreenStatistics { gradients, views });
     }
 
     /// After `step` (counted from 1): adds and removes rows when it is time to.
@@ -174,10 +179,10 @@ impl AdaptiveDensity {
         let mut report = None;
         let start = settings.start.min(self.run.steps / 4);
         let due = step > start && step.is_multiple_of(settings.every);
-        if due && let Some((total, views)) = self.statistics.take() {
-            let gradients: Vec<f64> = host(total)
+        if due && let Some(sums) = self.statistics.take() {
+            let gradients: Vec<f64> = host(sums.gradients)
                 .into_iter()
-                .zip(host(views))
+                .zip(host(sums.views))
                 .map(|(total, views)| f64::from(total) / f64::from(views.max(1.0)))
                 .collect();
             let (plan, refinement) = self.plan(step, &gaussians.to_data(), &gradients);
@@ -350,7 +355,8 @@ mod tests {
         };
         for x in [3.0, f32::NAN, f32::INFINITY, 1.0] {
             let gradient = Tensor::<3>::from_floats([[[x, 0.0], [2.0, 0.0]]], &device);
-            density.observe(gradient, Tensor::ones([1, 2, 2], &device), size);
+            let seen = Tensor::ones([1, 2, 2], &device);
+            density.observe(gradient, seen, size).unwrap();
         }
         let (gradients, views) = density.statistics().unwrap();
         assert_eq!((gradients, views), (vec![4.0, 8.0], vec![4.0, 4.0]));

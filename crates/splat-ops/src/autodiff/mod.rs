@@ -2,10 +2,13 @@
 //! flows. A tracked op has N parents and one output; only gradients of tracked parents are asked
 //! of the backend.
 
+mod activation;
 mod blur;
 mod photometric;
 mod project;
 mod rasterize;
+mod screen_probe;
+mod sh_colors;
 mod spherical_harmonics;
 mod ssim;
 
@@ -14,8 +17,9 @@ use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::{Autodiff, AutodiffBackend, tensor::FloatTensor};
 
+use crate::activation::Activation;
 use crate::adam::AdamStep;
-use crate::backend::{AdamTensors, Background, SplatBackend, SplatOps, Target};
+use crate::backend::{AdamTensors, Optional, SplatBackend, SplatOps, StatisticsTensors, Target};
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
 
@@ -39,11 +43,29 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
         spherical_harmonics::spherical_harmonics::<B, C>([coeffs, dirs], degree)
     }
 
+    fn sh_colors(
+        sh0: FloatTensor<Self>,
+        sh_rest: Optional<Self>,
+        means: FloatTensor<Self>,
+        centers: FloatTensor<Self>,
+        degree: usize,
+    ) -> FloatTensor<Self> {
+        sh_colors::sh_colors::<B, C>(sh0, sh_rest.into_option(), means, centers, degree)
+    }
+
+    fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self> {
+        activation::activation::<B, C>(x, function)
+    }
+
+    fn screen_probe(packed: FloatTensor<Self>, probe: FloatTensor<Self>) -> FloatTensor<Self> {
+        screen_probe::screen_probe::<B, C>(packed, probe)
+    }
+
     fn rasterize(
         packed: FloatTensor<Self>,
         colors: FloatTensor<Self>,
         opacities: FloatTensor<Self>,
-        background: Background<Self>,
+        background: Optional<Self>,
         args: RasterizeArgs,
     ) -> FloatTensor<Self> {
         rasterize::rasterize::<B, C>([packed, colors, opacities], background, args)
@@ -80,6 +102,18 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
             moment_1,
             moment_2,
         }
+    }
+
+    fn screen_statistics(
+        gradient: FloatTensor<Self>,
+        extents: FloatTensor<Self>,
+        gradients: FloatTensor<Self>,
+        views: FloatTensor<Self>,
+        half: [f64; 2],
+    ) -> StatisticsTensors<Self> {
+        let tensors = [gradient, extents, gradients, views].map(|tensor| tensor.into_primitive());
+        let [gradients, views] = B::add_screen_statistics(tensors, half).map(Self::from_inner);
+        StatisticsTensors { gradients, views }
     }
 }
 

@@ -7,7 +7,7 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
 use super::register;
-use crate::backend::{Background, SplatBackend};
+use crate::backend::{Optional, SplatBackend};
 use crate::settings::RasterizeArgs;
 
 #[derive(Debug)]
@@ -67,12 +67,12 @@ impl<B: SplatBackend> Backward<B, 4> for RasterizeBackward {
 
 pub(super) fn rasterize<B: SplatBackend, C: CheckpointStrategy>(
     inputs: [FloatTensor<Autodiff<B, C>>; 3],
-    background: Background<Autodiff<B, C>>,
+    background: Optional<Autodiff<B, C>>,
     args: RasterizeArgs,
 ) -> FloatTensor<Autodiff<B, C>> {
     let [packed, colors, opacities] = inputs.each_ref().map(|input| input.node());
     match background {
-        Background::Color(background) => record::<B, C, 4>(
+        Optional::Some(background) => record::<B, C, 4>(
             RasterizeBackward
                 .prepare::<C>([packed, colors, opacities, background.node()])
                 .compute_bound()
@@ -81,7 +81,7 @@ pub(super) fn rasterize<B: SplatBackend, C: CheckpointStrategy>(
             Some(background),
             args,
         ),
-        Background::None => record::<B, C, 3>(
+        Optional::None => record::<B, C, 3>(
             RasterizeBackward
                 .prepare::<C>([packed, colors, opacities])
                 .compute_bound()

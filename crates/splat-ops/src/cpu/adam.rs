@@ -1,51 +1,135 @@
-//! Adam in one pass over memory.
+//! Adam in one pass over memory, in place.
 
 use core::marker::PhantomData;
 
 use burn::backend::TensorMetadata;
 use burn::backend::flex::FlexTensor;
-use burn::tensor::TensorData;
 use rayon::prelude::*;
 
-use super::buffer::{Buffer, overwritten};
+use super::buffer::{Buffer, BufferMut};
 use super::real::Real;
-use crate::adam::AdamStep;
+use super::simd::vectorized;
+use crate::adam::{AdamRows, AdamStep};
 
-/// Elements per unit of parallel work.
+/// Elements per unit of parallel work, about.
 const CHUNK: usize = 8192;
 
+/// The numbers of a step in the precision of the tensors.
+struct Numbers<T> {
+    beta_1: T,
+    beta_2: T,
+    rest_1: T,
+    rest_2: T,
+    rate: T,
+    epsilon: T,
+}
+
+/// Parameter and moments are written into their own memory, unless something else holds that too.
 pub(super) fn step<T: Real>(
     _: PhantomData<T>,
     [param, grad, moment_1, moment_2]: [FlexTensor; 4],
     step: &AdamStep,
 ) -> [FlexTensor; 3] {
-    let shape = param.shape();
-    let buffers = [param, grad, moment_1, moment_2].map(Buffer::new);
-    let [param, grad, moment_1, moment_2] = buffers.each_ref().map(|b| b.slice::<T>());
-    let (beta_1, beta_2) = (T::of(step.beta_1), T::of(step.beta_2));
-    let (rest_1, rest_2) = (T::of(1.0 - step.beta_1), T::of(1.0 - step.beta_2));
-    let (rate, epsilon) = (T::of(step.rate), T::of(step.epsilon));
+    let numbers = Numbers {
+        beta_1: T::of(step.beta_1),
+        beta_2: T::of(step.beta_2),
+        rest_1: T::of(1.0 - step.beta_1),
+        rest_2: T::of(1.0 - step.beta_2),
+        rate: T::of(step.rate),
+        epsilon: T::of(step.epsilon),
+    };
+    let rows = param.shape()[0].max(1);
+    let width = (param.shape().num_elements() / rows).max(1);
+    let chunk = CHUNK.next_multiple_of(width);
 
-    let mut out = [(); 3].map(|()| overwritten::<T>(param.len()));
-    let [out_param, out_1, out_2] = &mut out;
-    out_param
-        .par_chunks_mut(CHUNK)
-        .zip(out_1.par_chunks_mut(CHUNK))
-        .zip(out_2.par_chunks_mut(CHUNK))
-        .enumerate()
-        .for_each(|(chunk, ((out_param, out_1), out_2))| {
-            let range = chunk * CHUNK..chunk * CHUNK + out_param.len();
-            let (param, grad) = (&param[range.clone()], &grad[range.clone()]);
-            let (moment_1, moment_2) = (&moment_1[range.clone()], &moment_2[range]);
-            for i in 0..out_param.len() {
-                let usable = (grad[i] * grad[i]).is_finite();
-                let g = if usable { grad[i] } else { T::ZERO };
-                let m = moment_1[i] * beta_1 + g * rest_1;
-                let v = moment_2[i] * beta_2 + g * g * rest_2;
-                out_1[i] = m;
-                out_2[i] = v;
-                out_param[i] = param[i] - m / (v.sqrt() + epsilon) * rate;
+    let grad = Buffer::new(grad);
+    let mut stepped = [param, moment_1, moment_2].map(BufferMut::new);
+    let [param, moment_1, moment_2] = stepped.each_mut().map(|buffer| buffer.slice::<T>());
+    param
+        .par_chunks_mut(chunk)
+        .zip(moment_1.par_chunks_mut(chunk))
+        .zip(moment_2.par_chunks_mut(chunk))
+        .zip(grad.slice::<T>().par_chunks(chunk))
+        .for_each(|(((param, moment_1), moment_2), grad)| match step.rows {
+            AdamRows::All => update(param, moment_1, moment_2, grad, &numbers),
+            AdamRows::Seen => {
+                let rows = param
+                    .chunks_exact_mut(width)
+                    .zip(moment_1.chunks_exact_mut(width))
+                    .zip(moment_2.chunks_exact_mut(width))
+                    .zip(grad.chunks_exact(width));
+                for (((param, moment_1), moment_2), grad) in rows {
+                    // NaN counts as zero.
+                    if grad.iter().any(|g| g.abs() > T::ZERO) {
+                        update(param, moment_1, moment_2, grad, &numbers);
+                    }
+                }
             }
         });
-    out.map(|values| FlexTensor::from_data(TensorData::new(values, shape.clone())))
+    stepped.map(BufferMut::into_tensor)
+}
+
+vectorized! {
+    /// Steps a run of elements.
+    fn update<T: Real, const FMA: bool>(
+        param: &mut [T],
+        moment_1: &mut [T],
+        moment_2: &mut [T],
+        grad: &[T],
+        numbers: &Numbers<T>,
+    ) {
+        let elements = param.iter_mut().zip(moment_1).zip(moment_2).zip(grad);
+        for (((param, moment_1), moment_2), grad) in elements {
+            let usable = (*grad * *grad).is_finite();
+            let g = if usable { *grad } else { T::ZERO };
+            let m = *moment_1 * numbers.beta_1 + g * numbers.rest_1;
+            let v = *moment_2 * numbers.beta_2 + g * g * numbers.rest_2;
+            *moment_1 = m;
+            *moment_2 = v;
+            *param -= m / (v.sqrt() + numbers.epsilon) * numbers.rate;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::TensorData;
+
+    use super::*;
+
+    const STEP: AdamStep = AdamStep {
+        beta_1: 0.9,
+        beta_2: 0.999,
+        rate: 0.1,
+        epsilon: 1e-8,
+        rows: AdamRows::All,
+    };
+
+    fn tensor(values: &[f32]) -> FlexTensor {
+        FlexTensor::from_data(TensorData::new(values.to_vec(), [values.len() / 2, 2]))
+    }
+
+    fn values(tensor: &FlexTensor) -> &[f32] {
+        tensor.as_slice().unwrap()
+    }
+
+    #[test]
+    fn memory_that_nobody_else_holds_is_written_in_place() {
+        let start = [1.0, -2.0, 0.5, 3.0];
+        let tensors = || [start, [0.1, 0.0, -0.2, 0.3], [0.0; 4], [0.0; 4]].map(|v| tensor(&v));
+
+        let alone = tensors();
+        let places = [0, 2, 3].map(|i| values(&alone[i]).as_ptr());
+        let stepped = step(PhantomData::<f32>, alone, &STEP);
+        assert_eq!(places, stepped.each_ref().map(|t| values(t).as_ptr()));
+        assert_ne!(values(&stepped[0]), start);
+
+        let shared = tensors();
+        let held = shared.clone();
+        let again = step(PhantomData::<f32>, shared, &STEP);
+        assert_eq!(values(&held[0]), start);
+        for (stepped, again) in stepped.iter().zip(&again) {
+            assert_eq!(values(stepped), values(again));
+        }
+    }
 }

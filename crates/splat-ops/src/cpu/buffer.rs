@@ -63,6 +63,29 @@ impl Buffer {
     }
 }
 
+/// A tensor to be overwritten: in its own memory where nothing else holds that, in a copy otherwise.
+pub(super) struct BufferMut {
+    tensor: FlexTensor,
+}
+
+impl BufferMut {
+    pub(super) fn new(tensor: FlexTensor) -> Self {
+        let contiguous = tensor.to_contiguous();
+        // Or its memory would count as shared.
+        drop(tensor);
+        Self { tensor: contiguous }
+    }
+
+    /// The elements. The caller has chosen `T` by the tensor's type.
+    pub(super) fn slice<T: Real>(&mut self) -> &mut [T] {
+        self.tensor.storage_mut()
+    }
+
+    pub(super) fn into_tensor(self) -> FlexTensor {
+        self.tensor
+    }
+}
+
 /// A tensor of the given values.
 pub(super) fn tensor<T: Real, const R: usize>(values: Vec<T>, shape: [usize; R]) -> FlexTensor {
     FlexTensor::from_data(TensorData::new(values, shape))

@@ -1,4 +1,7 @@
 //! Small vectors and matrices, in rows.
+//!
+//! For loops that are to become SIMD code: no branch, and no array method that takes a closure (`map`, `from_fn`), whose
+//! inner functions the compiler may leave in another unit, as calls.
 
 use super::real::Real;
 
@@ -41,7 +44,11 @@ pub(super) fn largest<T: Real>(a: Vec3<T>) -> T {
 /// `a / s`; zero where s is.
 #[inline(always)]
 pub(super) fn over<T: Real>(a: Vec3<T>, s: T) -> Vec3<T> {
-    if s == T::ZERO { a } else { a.map(|x| x / s) }
+    if s == T::ZERO {
+        a
+    } else {
+        [a[0] / s, a[1] / s, a[2] / s]
+    }
 }
 
 /// Componentwise product.
@@ -73,17 +80,25 @@ pub(super) fn add3<T: Real>(a: &Mat3<T>, b: &Mat3<T>) -> Mat3<T> {
     [add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2])]
 }
 
-/// Unit quaternion (w, x, y, z) and the length it had; `None` when it has none or is not finite.
-/// Scaled by the largest entry first, so that neither tiny nor huge ones under- or overflow.
+/// Unit quaternion (w, x, y, z), the length it had, and whether it had one and is finite; what is returned otherwise has
+/// no meaning. Scaled by the largest entry first, so that neither tiny nor huge ones under- or overflow.
 #[inline(always)]
-pub(super) fn normalize_quat<T: Real>(q: [T; 4]) -> Option<([T; 4], T)> {
-    let largest = q.iter().fold(T::ZERO, |m, x| m.greatest(x.abs()));
-    if !(largest > T::ZERO && q.iter().all(|x| x.is_finite())) {
-        return None;
+pub(super) fn normalize_quat<T: Real>(q: [T; 4]) -> ([T; 4], T, bool) {
+    let mut largest = T::ZERO;
+    let mut finite = true;
+    for x in q {
+        largest = largest.greatest(x.abs());
+        finite &= x.is_finite();
     }
-    let scaled = q.map(|x| x / largest);
-    let length = scaled.iter().map(|x| *x * *x).sum::<T>().sqrt();
-    Some((scaled.map(|x| x / length), length * largest))
+    let [w, x, y, z] = [
+        q[0] / largest,
+        q[1] / largest,
+        q[2] / largest,
+        q[3] / largest,
+    ];
+    let length = (w * w + x * x + y * y + z * z).sqrt();
+    let unit = [w / length, x / length, y / length, z / length];
+    (unit, length * largest, finite & (largest > T::ZERO))
 }
 
 /// Rotation matrix of a unit quaternion (w, x, y, z).
@@ -123,8 +138,12 @@ pub(super) fn rotation_backward<T: Real>(unit: [T; 4], length: T, g: &Mat3<T>) -
             - two * y * (g[0][0] + g[2][2]),
         w * (g[1][0] - g[0][1]) + x * (g[0][2] + g[2][0]) + y * (g[1][2] + g[2][1])
             - two * z * (g[0][0] + g[1][1]),
+    ];
+    let radial = d[0] * w + d[1] * x + d[2] * y + d[3] * z;
+    [
+        two * (d[0] - w * radial) / length,
+        two * (d[1] - x * radial) / length,
+        two * (d[2] - y * radial) / length,
+        two * (d[3] - z * radial) / length,
     ]
-    .map(|v| two * v);
-    let radial: T = d.iter().zip(unit).map(|(d, u)| *d * u).sum();
-    core::array::from_fn(|i| (d[i] - unit[i] * radial) / length)
 }

@@ -6,6 +6,7 @@
 //! Every op runs in a `tracing` span of its name, level trace, on the caller's thread: one load and a branch where nobody
 //! listens.
 
+mod activation;
 mod adam;
 mod blur;
 pub(crate) mod buffer;
@@ -18,6 +19,8 @@ pub(crate) mod poison;
 mod project;
 mod rasterize;
 pub(crate) mod real;
+mod screen_statistics;
+mod sh_colors;
 mod simd;
 mod spherical_harmonics;
 
@@ -30,8 +33,10 @@ pub use instructions::InstructionSet;
 
 pub use rasterize::{RasterizeWork, rasterize_work};
 
+use crate::activation::Activation;
 use crate::adam::AdamStep;
-use crate::backend::{SplatBackend, Target};
+use crate::backend::{ShInputs, SplatBackend, Target};
+use crate::composed;
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
 
@@ -112,6 +117,42 @@ impl SplatBackend for Flex {
             degree,
             wanted
         )
+    }
+
+    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> FlexTensor {
+        let _span = trace_span!("colours").entered();
+        in_precision!(inputs.means, sh_colors::forward, inputs, degree)
+    }
+
+    fn sh_colors_backward(
+        inputs: ShInputs<Self>,
+        grad: FlexTensor,
+        degree: usize,
+        wanted: [bool; 4],
+    ) -> [Option<FlexTensor>; 4] {
+        let _span = trace_span!("colours gradient").entered();
+        in_precision!(grad, sh_colors::backward, inputs, grad, degree, wanted)
+    }
+
+    fn activate(x: FlexTensor, function: Activation) -> FlexTensor {
+        let _span = trace_span!("activations").entered();
+        match x.dtype() {
+            DType::F32 | DType::F64 => in_precision!(x, activation::forward, x, function),
+            _ => composed::activate::<Self>(x, function),
+        }
+    }
+
+    fn activate_backward(
+        x: FlexTensor,
+        y: FlexTensor,
+        grad: FlexTensor,
+        function: Activation,
+    ) -> FlexTensor {
+        let _span = trace_span!("activations gradient").entered();
+        match x.dtype() {
+            DType::F32 | DType::F64 => in_precision!(x, activation::backward, x, y, grad, function),
+            _ => composed::activate_backward::<Self>(x, y, grad, function),
+        }
     }
 
     fn rasterize_forward(
@@ -195,6 +236,10 @@ impl SplatBackend for Flex {
             slope,
             grad
         )
+    }
+
+    fn add_screen_statistics(tensors: [FlexTensor; 4], half: [f64; 2]) -> [FlexTensor; 2] {
+        in_precision!(tensors[0], screen_statistics::add, tensors, half)
     }
 
     fn adam(tensors: [FlexTensor; 4], step: &AdamStep) -> [FlexTensor; 3] {

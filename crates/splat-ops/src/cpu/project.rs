@@ -16,357 +16,33 @@
 //! V and e are taken in units of the splat's own size (`k` pixels), so that nothing over- or underflows, be the splat
 //! a millionth of a pixel or a million pictures wide.
 
+mod gradient;
+mod splat;
+
 use core::marker::PhantomData;
+use core::ops::Range;
 
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
+use self::gradient::splat_backward;
+use self::splat::{Camera, Gaussian, Splat};
 use super::buffer::{Buffer, overwritten, tensor};
-use super::math::*;
 use super::real::Real;
+use super::simd::{LANES, Lanes, vectorized};
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::ProjectArgs;
 
-/// Splats larger than this many pixels are all alike: constant over any picture.
-const SIZE_MAX: f64 = 1e12;
-
 /// Gaussians per unit of parallel work. Fixed, so that sums over Gaussians have a fixed order.
 const CHUNK: usize = 512;
+/// Columns of a Gaussian in lanes: mean, quaternion, scales.
+const GAUSSIAN: usize = 10;
+/// Columns of a splat that carry a gradient: all but the extents.
+const GRADED: usize = 7;
+/// Columns of a camera's gradient in lanes: W, t, then fx, fy, cx, cy.
+const CAMERA: usize = 16;
 
-/// One camera, in the precision of the op.
-struct Camera<T> {
-    /// World to camera, 3x3 block.
-    w: Mat3<T>,
-    t: Vec3<T>,
-    fx: T,
-    fy: T,
-    cx: T,
-    cy: T,
-    /// Bounds of u and v for the Jacobian.
-    u: (T, T),
-    v: (T, T),
-    width: T,
-    height: T,
-    near: T,
-    far: T,
-    /// Square root of `eps2d`.
-    blur: T,
-    /// Standard deviations to where alpha has fallen from 1 to `alpha_min`.
-    reach: T,
-}
-
-impl<T: Real> Camera<T> {
-    fn new(viewmat: &[T], intrinsics: &[T], args: &ProjectArgs) -> Self {
-        let row = |i: usize| [viewmat[4 * i], viewmat[4 * i + 1], viewmat[4 * i + 2]];
-        let [fx, fy, cx, cy] = [0, 1, 2, 3].map(|i| intrinsics[i]);
-        let (width, height) = (
-            T::of(args.size.width.into()),
-            T::of(args.size.height.into()),
-        );
-        let margin = T::of(args.settings.clamp_margin);
-        let bounds =
-            |f: T, c: T, side: T| (-(c + margin * side) / f, (side - c + margin * side) / f);
-        Self {
-            w: [row(0), row(1), row(2)],
-            t: [viewmat[3], viewmat[7], viewmat[11]],
-            fx,
-            fy,
-            cx,
-            cy,
-            u: bounds(fx, cx, width),
-            v: bounds(fy, cy, height),
-            width,
-            height,
-            near: T::of(args.settings.near),
-            far: T::of(args.settings.far),
-            blur: T::of(args.settings.eps2d.sqrt()),
-            reach: T::of((-2.0 * args.settings.alpha_min.ln()).max(0.0).sqrt()),
-        }
-    }
-}
-
-/// One Gaussian.
-#[derive(Clone, Copy)]
-struct Gaussian<T> {
-    mean: Vec3<T>,
-    quat: [T; 4],
-    scale: Vec3<T>,
-}
-
-/// What the forward computes on its way; the backward computes it again.
-struct Splat<T> {
-    p: Vec3<T>,
-    /// x/z and y/z, clamped.
-    u: T,
-    v: T,
-    u_inside: bool,
-    v_inside: bool,
-    unit: [T; 4],
-    length: T,
-    rotation: Mat3<T>,
-    /// J W.
-    jw: Mat23<T>,
-    /// J W R.
-    jwr: Mat23<T>,
-    /// Unit of length of everything below but `packed`, in pixels.
-    k: T,
-    /// Larger than `SIZE_MAX`: its shape has no influence.
-    flat: bool,
-    v1: Vec3<T>,
-    v2: Vec3<T>,
-    /// Direction of the minors, not normalised, and its length.
-    minors: Vec3<T>,
-    minors_norm: T,
-    /// Length of the minors.
-    minors_length: T,
-    e: T,
-    a: T,
-    b: T,
-    det: T,
-    w11: T,
-    w21: T,
-    w22: T,
-    packed: [T; PROJECTED_WIDTH],
-}
-
-impl<T: Real> Splat<T> {
-    /// `None`: culled. Comparisons are written so that NaN culls.
-    #[inline(always)]
-    fn new(g: Gaussian<T>, camera: &Camera<T>) -> Option<Self> {
-        let p = add(apply(&camera.w, g.mean), camera.t);
-        let [x, y, z] = p;
-        if !(z >= camera.near && z <= camera.far) {
-            return None;
-        }
-        let (unit, length) = normalize_quat(g.quat)?;
-        let rotation = rotation(unit);
-
-        let (u_free, v_free) = (x / z, y / z);
-        let u = u_free.greatest(camera.u.0).least(camera.u.1);
-        let v = v_free.greatest(camera.v.0).least(camera.v.1);
-        let jw: Mat23<T> = [
-            add(
-                scale(camera.w[0], camera.fx / z),
-                scale(camera.w[2], -camera.fx * u / z),
-            ),
-            add(
-                scale(camera.w[1], camera.fy / z),
-                scale(camera.w[2], -camera.fy * v / z),
-            ),
-        ];
-        let jwr = jw.map(|row| apply_transposed(&rotation, row));
-        // V over its largest entry, `size` pixels.
-        let largest_scale = largest(g.scale);
-        let rows = jwr.map(|row| hadamard(row, over(g.scale, largest_scale)));
-        let largest_entry = largest(rows[0]).greatest(largest(rows[1]));
-        let rows = rows.map(|row| over(row, largest_entry));
-        let size = largest_entry * largest_scale;
-        let flat = size > T::of(SIZE_MAX);
-        let size = size.least(T::of(SIZE_MAX));
-
-        let k = size.greatest(camera.blur);
-        let (share, blur) = (size / k, camera.blur / k);
-        let [v1, v2] = rows.map(|row| scale(row, share));
-        let minors = cross(rows[0], rows[1]);
-        let minors_norm = dot(minors, minors).sqrt();
-        let minors_length = share * share * minors_norm;
-        let (n1, n2) = (dot(v1, v1), dot(v2, v2));
-        let e = blur * blur;
-        let (a, b) = (n1 + e, dot(v1, v2));
-        let det = minors_length * minors_length + e * (n1 + n2) + e * e;
-
-        let mean = [
-            camera.fx * u_free + camera.cx,
-            camera.fy * v_free + camera.cy,
-        ];
-        let reach = camera.reach * k;
-        let extent = [reach * a.sqrt(), reach * (n2 + e).sqrt()];
-        let reaches = mean[0] + extent[0] > T::ZERO
-            && mean[0] - extent[0] < camera.width
-            && mean[1] + extent[1] > T::ZERO
-            && mean[1] - extent[1] < camera.height;
-        if !reaches {
-            return None;
-        }
-        let w11 = T::ONE / a.sqrt();
-        let w22 = (a / det).sqrt();
-        let w21 = -(b / a) * w22;
-        let packed = [
-            mean[0],
-            mean[1],
-            z,
-            w11 / k,
-            w21 / k,
-            w22 / k,
-            minors_length / det.sqrt(),
-            extent[0],
-            extent[1],
-        ];
-        packed.iter().all(|x| x.is_finite()).then_some(Self {
-            p,
-            u,
-            v,
-            u_inside: u_free >= camera.u.0 && u_free <= camera.u.1,
-            v_inside: v_free >= camera.v.0 && v_free <= camera.v.1,
-            unit,
-            length,
-            rotation,
-            jw,
-            jwr,
-            k,
-            flat,
-            v1,
-            v2,
-            minors,
-            minors_norm,
-            minors_length,
-            e,
-            a,
-            b,
-            det,
-            w11,
-            w21,
-            w22,
-            packed,
-        })
-    }
-}
-
-/// Gradients of one (camera, Gaussian) pair.
-struct Gradient<T> {
-    mean: Vec3<T>,
-    quat: [T; 4],
-    scale: Vec3<T>,
-    camera: CameraGradient<T>,
-}
-
-/// Gradient of one camera: of W and t, and of fx, fy, cx, cy.
-#[derive(Clone, Copy)]
-struct CameraGradient<T> {
-    w: Mat3<T>,
-    t: Vec3<T>,
-    intrinsics: [T; 4],
-}
-
-impl<T: Real> CameraGradient<T> {
-    const ZERO: Self = Self {
-        w: [[T::ZERO; 3]; 3],
-        t: [T::ZERO; 3],
-        intrinsics: [T::ZERO; 4],
-    };
-
-    fn add(&mut self, other: &Self) {
-        self.w = add3(&self.w, &other.w);
-        self.t = add(self.t, other.t);
-        for (sum, value) in self.intrinsics.iter_mut().zip(other.intrinsics) {
-            *sum += value;
-        }
-    }
-}
-
-/// The vector-Jacobian product of [`Splat::new`], `grad` being the gradient of `packed`.
-#[inline(always)]
-fn splat_backward<T: Real>(
-    g: Gaussian<T>,
-    camera: &Camera<T>,
-    s: &Splat<T>,
-    grad: &[T],
-) -> Gradient<T> {
-    let half = T::of(0.5);
-    let two = T::of(2.0);
-    let (e, w11, w22) = (s.e, s.w11, s.w22);
-    let compensation = s.packed[6];
-
-    // Inverse Cholesky factor (packed in 1 / pixels, here in 1 / k) and compensation -> a, b, det, |m|.
-    let [g11, g21, g22] = [3, 4, 5].map(|i| grad[i] / s.k);
-    let g22 = g22 - g21 * s.b / s.a;
-    let db = -g21 * w22 / s.a;
-    let da = (half * g22 * w22 - g21 * s.w21) / s.a - half * g11 * w11 * w11 * w11;
-    let ddet = -half * (g22 * w22 + grad[6] * compensation) / s.det;
-    let dlength = two * ddet * s.minors_length + grad[6] / s.det.sqrt();
-
-    // a, b, det, |m| -> V. |m| has no derivative at zero; zero is its least subgradient.
-    let dm = if s.minors_norm > T::ZERO {
-        scale(s.minors, dlength / s.minors_norm)
-    } else {
-        [T::ZERO; 3]
-    };
-    // V in units of k -> V in pixels.
-    let pixels = if s.flat { T::ZERO } else { T::ONE / s.k };
-    let dv1 = add(
-        add(scale(s.v1, two * (da + e * ddet)), scale(s.v2, db)),
-        cross(s.v2, dm),
-    );
-    let dv2 = add(
-        add(scale(s.v2, two * e * ddet), scale(s.v1, db)),
-        cross(dm, s.v1),
-    );
-    let (dv1, dv2) = (scale(dv1, pixels), scale(dv2, pixels));
-
-    // V = (J W R) diag(s) -> scales, R, J W.
-    let dscale = add(hadamard(dv1, s.jwr[0]), hadamard(dv2, s.jwr[1]));
-    let djwr = [hadamard(dv1, g.scale), hadamard(dv2, g.scale)];
-    let drotation = add3(&outer(s.jw[0], djwr[0]), &outer(s.jw[1], djwr[1]));
-    let djw = djwr.map(|row| apply(&s.rotation, row));
-
-    // J W -> J, W.
-    let [_, _, z] = s.p;
-    let (fx, fy) = (camera.fx, camera.fy);
-    let dj11 = dot(djw[0], camera.w[0]);
-    let dj13 = dot(djw[0], camera.w[2]);
-    let dj22 = dot(djw[1], camera.w[1]);
-    let dj23 = dot(djw[1], camera.w[2]);
-    let mut dw = [
-        scale(djw[0], fx / z),
-        scale(djw[1], fy / z),
-        add(scale(djw[0], -fx * s.u / z), scale(djw[1], -fy * s.v / z)),
-    ];
-
-    // J -> fx, fy, u, v, z.
-    let mut dfx = (dj11 - dj13 * s.u) / z;
-    let mut dfy = (dj22 - dj23 * s.v) / z;
-    let (mut dcx, mut dcy) = (grad[0], grad[1]);
-    let du = -dj13 * fx / z;
-    let dv = -dj23 * fy / z;
-    let mut dz = grad[2] - (fx * (dj11 - dj13 * s.u) + fy * (dj22 - dj23 * s.v)) / (z * z);
-
-    // Screen mean (not clamped) -> x/z, y/z.
-    let (x_z, y_z) = (s.p[0] / z, s.p[1] / z);
-    dfx += grad[0] * x_z;
-    dfy += grad[1] * y_z;
-    let (mut dx_z, mut dy_z) = (grad[0] * fx, grad[1] * fy);
-
-    // Clamp: inside it passes on; outside u = const / fx - cx / fx is the camera's.
-    if s.u_inside {
-        dx_z += du;
-    } else {
-        dcx -= du / fx;
-        dfx -= du * s.u / fx;
-    }
-    if s.v_inside {
-        dy_z += dv;
-    } else {
-        dcy -= dv / fy;
-        dfy -= dv * s.v / fy;
-    }
-    dz -= (dx_z * x_z + dy_z * y_z) / z;
-
-    // p = W mean + t.
-    let dp = [dx_z / z, dy_z / z, dz];
-    dw = add3(&dw, &outer(dp, g.mean));
-    Gradient {
-        mean: apply_transposed(&camera.w, dp),
-        quat: rotation_backward(s.unit, s.length, &drotation),
-        scale: dscale,
-        camera: CameraGradient {
-            w: dw,
-            t: dp,
-            intrinsics: [dfx, dfy, dcx, dcy],
-        },
-    }
-}
-
-/// The five inputs as slices.
+/// The five inputs.
 struct Inputs<'a, T> {
     means: &'a [T],
     quats: &'a [T],
@@ -394,11 +70,43 @@ impl<'a, T: Real> Inputs<'a, T> {
         self.means.len() / 3
     }
 
-    fn gaussian(&self, n: usize) -> Gaussian<T> {
-        Gaussian {
-            mean: core::array::from_fn(|i| self.means[3 * n + i]),
-            quat: core::array::from_fn(|i| self.quats[4 * n + i]),
-            scale: core::array::from_fn(|i| self.scales[3 * n + i]),
+    /// Up to [`LANES`] Gaussians in columns. Lanes beyond them hold a quaternion of length zero: culled.
+    fn load(&self, rows: impl Iterator<Item = usize>) -> [Lanes<T>; GAUSSIAN] {
+        let mut columns = [[T::ZERO; LANES]; GAUSSIAN];
+        for (lane, n) in rows.enumerate() {
+            let mean = &self.means[3 * n..3 * n + 3];
+            let quat = &self.quats[4 * n..4 * n + 4];
+            let scale = &self.scales[3 * n..3 * n + 3];
+            for (column, value) in columns.iter_mut().zip(mean.iter().chain(quat).chain(scale)) {
+                column[lane] = *value;
+            }
+        }
+        columns
+    }
+}
+
+#[inline(always)]
+fn gaussian<T: Real>(columns: &[Lanes<T>; GAUSSIAN], lane: usize) -> Gaussian<T> {
+    let at = |column: usize| columns[column][lane];
+    Gaussian {
+        mean: [at(0), at(1), at(2)],
+        quat: [at(3), at(4), at(5), at(6)],
+        scale: [at(7), at(8), at(9)],
+    }
+}
+
+vectorized! {
+    /// The packed columns of a block of splats; zero where culled.
+    fn project_lanes<T: Real, const FMA: bool>(
+        gaussians: &[Lanes<T>; GAUSSIAN],
+        camera: &Camera<T>,
+        packed: &mut [Lanes<T>; PROJECTED_WIDTH],
+    ) {
+        for lane in 0..LANES {
+            let splat = Splat::new(gaussian(gaussians, lane), camera);
+            for column in 0..PROJECTED_WIDTH {
+                packed[column][lane] = if splat.visible { splat.packed[column] } else { T::ZERO };
+            }
         }
     }
 }
@@ -419,25 +127,116 @@ pub(super) fn forward<T: Real>(
             .zip(packed.chunks_exact_mut(n * PROJECTED_WIDTH))
         {
             packed
-                .par_chunks_mut(PROJECTED_WIDTH)
-                .with_min_len(CHUNK)
+                .par_chunks_mut(LANES * PROJECTED_WIDTH)
+                .with_min_len(CHUNK / LANES)
                 .enumerate()
-                .for_each(|(n, row)| match Splat::new(inputs.gaussian(n), camera) {
-                    Some(splat) => row.copy_from_slice(&splat.packed),
-                    None => row.fill(T::ZERO),
+                .for_each(|(block, packed)| {
+                    let first = block * LANES;
+                    let count = packed.len() / PROJECTED_WIDTH;
+                    let gaussians = inputs.load(first..first + count);
+                    let mut columns = [[T::ZERO; LANES]; PROJECTED_WIDTH];
+                    project_lanes(&gaussians, camera, &mut columns);
+                    for (lane, row) in packed.chunks_exact_mut(PROJECTED_WIDTH).enumerate() {
+                        for (value, column) in row.iter_mut().zip(&columns) {
+                            *value = column[lane];
+                        }
+                    }
                 });
         }
     }
     tensor(packed, [c, n, PROJECTED_WIDTH])
 }
 
-/// Gradients of one chunk of Gaussians, summed over the cameras, and of the cameras, summed over
-/// the chunk.
-struct ChunkGradient<T> {
-    means: Vec<T>,
-    quats: Vec<T>,
-    scales: Vec<T>,
-    cameras: Vec<CameraGradient<T>>,
+vectorized! {
+    /// Gradients of a block of Gaussians in one camera, and what they add to those of the camera; nothing where culled.
+    fn project_lanes_backward<T: Real, const FMA: bool>(
+        gaussians: &[Lanes<T>; GAUSSIAN],
+        camera: &Camera<T>,
+        grad: &[Lanes<T>; GRADED],
+        gradients: &mut [Lanes<T>; GAUSSIAN],
+        of_camera: &mut [Lanes<T>; CAMERA],
+    ) {
+        for lane in 0..LANES {
+            let gaussian = gaussian(gaussians, lane);
+            let splat = Splat::new(gaussian, camera);
+            let grad = [
+                grad[0][lane], grad[1][lane], grad[2][lane], grad[3][lane], grad[4][lane], grad[5][lane], grad[6][lane],
+            ];
+            let g = splat_backward(gaussian, camera, &splat, grad);
+            let kept = |value: T| if splat.visible { value } else { T::ZERO };
+            for i in 0..3 {
+                gradients[i][lane] = kept(g.mean[i]);
+                gradients[7 + i][lane] = kept(g.scale[i]);
+                for j in 0..3 {
+                    of_camera[3 * i + j][lane] += kept(g.w[i][j]);
+                }
+                of_camera[9 + i][lane] += kept(g.t[i]);
+            }
+            for i in 0..4 {
+                gradients[3 + i][lane] = kept(g.quat[i]);
+                of_camera[12 + i][lane] += kept(g.intrinsics[i]);
+            }
+        }
+    }
+}
+
+/// The gradients of one chunk of Gaussians, where they belong.
+struct Chunk<'a, T> {
+    rows: Range<usize>,
+    means: &'a mut [T],
+    quats: &'a mut [T],
+    scales: &'a mut [T],
+}
+
+impl<T: Real> Chunk<'_, T> {
+    /// Adds the gradients through one camera; returns the camera's.
+    fn add(&mut self, inputs: &Inputs<T>, camera: &Camera<T>, grad: &[T]) -> [T; CAMERA] {
+        let mut of_camera = [[T::ZERO; LANES]; CAMERA];
+        let mut block = [0; LANES];
+        let mut count = 0;
+        for row in self.rows.clone() {
+            let graded = &grad[row * PROJECTED_WIDTH..][..GRADED];
+            // Most splats of most views have none: culled, covered, or too faint.
+            if graded.iter().any(|g| *g != T::ZERO) {
+                block[count] = row;
+                count += 1;
+            }
+            if count == LANES {
+                self.add_block(&block, inputs, camera, grad, &mut of_camera);
+                count = 0;
+            }
+        }
+        self.add_block(&block[..count], inputs, camera, grad, &mut of_camera);
+        of_camera.map(|lanes| lanes.into_iter().fold(T::ZERO, |sum, value| sum + value))
+    }
+
+    fn add_block(
+        &mut self,
+        rows: &[usize],
+        inputs: &Inputs<T>,
+        camera: &Camera<T>,
+        grad: &[T],
+        of_camera: &mut [Lanes<T>; CAMERA],
+    ) {
+        let gaussians = inputs.load(rows.iter().copied());
+        let mut graded = [[T::ZERO; LANES]; GRADED];
+        for (lane, row) in rows.iter().enumerate() {
+            for (column, value) in graded.iter_mut().zip(&grad[row * PROJECTED_WIDTH..]) {
+                column[lane] = *value;
+            }
+        }
+        let mut gradients = [[T::ZERO; LANES]; GAUSSIAN];
+        project_lanes_backward(&gaussians, camera, &graded, &mut gradients, of_camera);
+        for (lane, row) in rows.iter().enumerate() {
+            let i = row - self.rows.start;
+            let mean = self.means[3 * i..3 * i + 3].iter_mut();
+            let quat = &mut self.quats[4 * i..4 * i + 4];
+            let scale = &mut self.scales[3 * i..3 * i + 3];
+            for (sum, column) in mean.chain(quat).chain(scale).zip(&gradients) {
+                *sum += column[lane];
+            }
+        }
+    }
 }
 
 pub(super) fn backward<T: Real>(
@@ -453,74 +252,57 @@ pub(super) fn backward<T: Real>(
     let grad = grad.slice::<T>();
     let (c, n) = (inputs.cameras.len(), inputs.count());
 
-    let chunks: Vec<ChunkGradient<T>> = (0..n.div_ceil(CHUNK))
-        .into_par_iter()
-        .map(|chunk| {
-            let range = chunk * CHUNK..n.min((chunk + 1) * CHUNK);
-            let mut sums = ChunkGradient {
-                means: vec![T::ZERO; range.len() * 3],
-                quats: vec![T::ZERO; range.len() * 4],
-                scales: vec![T::ZERO; range.len() * 3],
-                cameras: vec![CameraGradient::ZERO; c],
+    let [mut means, mut quats, mut scales] = [3, 4, 3].map(|width| vec![T::ZERO; n * width]);
+    let of_cameras: Vec<Vec<[T; CAMERA]>> = means
+        .par_chunks_mut(3 * CHUNK)
+        .zip(quats.par_chunks_mut(4 * CHUNK))
+        .zip(scales.par_chunks_mut(3 * CHUNK))
+        .enumerate()
+        .map(|(chunk, ((means, quats), scales))| {
+            let mut chunk = Chunk {
+                rows: chunk * CHUNK..n.min((chunk + 1) * CHUNK),
+                means,
+                quats,
+                scales,
             };
-            for (i, index) in range.enumerate() {
-                let gaussian = inputs.gaussian(index);
-                for (k, camera) in inputs.cameras.iter().enumerate() {
-                    let row = (k * n + index) * PROJECTED_WIDTH;
-                    let grad = &grad[row..row + PROJECTED_WIDTH];
-                    let Some(splat) = Splat::new(gaussian, camera) else {
-                        continue;
-                    };
-                    let gradient = splat_backward(gaussian, camera, &splat, grad);
-                    accumulate(&mut sums.means[3 * i..], &gradient.mean);
-                    accumulate(&mut sums.quats[4 * i..], &gradient.quat);
-                    accumulate(&mut sums.scales[3 * i..], &gradient.scale);
-                    sums.cameras[k].add(&gradient.camera);
-                }
-            }
-            sums
+            let views = inputs
+                .cameras
+                .iter()
+                .zip(grad.chunks_exact(n * PROJECTED_WIDTH));
+            views
+                .map(|(camera, grad)| chunk.add(&inputs, camera, grad))
+                .collect()
         })
         .collect();
 
-    let gather = |field: fn(&ChunkGradient<T>) -> &Vec<T>, width: usize| {
-        let mut values = Vec::with_capacity(n * width);
-        for chunk in &chunks {
-            values.extend_from_slice(field(chunk));
-        }
-        tensor(values, [n, width])
-    };
-    let mut cameras = vec![CameraGradient::ZERO; c];
-    for chunk in &chunks {
-        for (sum, camera) in cameras.iter_mut().zip(&chunk.cameras) {
-            sum.add(camera);
+    let mut cameras = vec![[T::ZERO; CAMERA]; c];
+    for chunk in &of_cameras {
+        for (sum, camera) in cameras.iter_mut().zip(chunk) {
+            for (sum, value) in sum.iter_mut().zip(camera) {
+                *sum += *value;
+            }
         }
     }
     [
-        wanted[0].then(|| gather(|chunk| &chunk.means, 3)),
-        wanted[1].then(|| gather(|chunk| &chunk.quats, 4)),
-        wanted[2].then(|| gather(|chunk| &chunk.scales, 3)),
+        wanted[0].then(|| tensor(means, [n, 3])),
+        wanted[1].then(|| tensor(quats, [n, 4])),
+        wanted[2].then(|| tensor(scales, [n, 3])),
         wanted[3].then(|| tensor(viewmat_gradients(&cameras), [c, 4, 4])),
         wanted[4].then(|| {
-            let values = cameras.iter().flat_map(|camera| camera.intrinsics);
+            let values = cameras.iter().flat_map(|camera| &camera[12..]).copied();
             tensor(values.collect(), [c, 4])
         }),
     ]
 }
 
-fn viewmat_gradients<T: Real>(cameras: &[CameraGradient<T>]) -> Vec<T> {
+fn viewmat_gradients<T: Real>(cameras: &[[T; CAMERA]]) -> Vec<T> {
     let mut values = Vec::with_capacity(cameras.len() * 16);
     for camera in cameras {
-        for (row, t) in camera.w.iter().zip(camera.t) {
+        for (row, t) in camera[..9].chunks_exact(3).zip(&camera[9..12]) {
             values.extend_from_slice(row);
-            values.push(t);
+            values.push(*t);
         }
         values.extend([T::ZERO; 4]);
     }
     values
-}
-
-fn accumulate<T: Real>(sums: &mut [T], values: &[T]) {
-    for (sum, value) in sums.iter_mut().zip(values) {
-        *sum += *value;
-    }
 }

@@ -53,6 +53,9 @@ pub(crate) trait Real:
     /// products and sums, for code that is compiled for a processor which has them.
     fn exp2_neg<const FMA: bool>(t: Self) -> Self;
 
+    /// `exp(x)`, to 2 units in the last place.
+    fn exp<const FMA: bool>(x: Self) -> Self;
+
     /// The lesser one; the second if the first is NaN.
     #[inline(always)]
     fn least(self, other: Self) -> Self {
@@ -104,6 +107,7 @@ impl Real for f64 {
     fn abs(self) -> Self {
         self.abs()
     }
+    #[inline(always)]
     fn is_finite(self) -> bool {
         self.is_finite()
     }
@@ -114,6 +118,10 @@ impl Real for f64 {
     #[inline(always)]
     fn exp2_neg<const FMA: bool>(t: Self) -> Self {
         (-t).exp2()
+    }
+    #[inline(always)]
+    fn exp<const FMA: bool>(x: Self) -> Self {
+        x.exp()
     }
 }
 
@@ -156,6 +164,7 @@ impl Real for f32 {
     fn abs(self) -> Self {
         self.abs()
     }
+    #[inline(always)]
     fn is_finite(self) -> bool {
         self.is_finite()
     }
@@ -166,6 +175,10 @@ impl Real for f32 {
     #[inline(always)]
     fn exp2_neg<const FMA: bool>(t: Self) -> Self {
         exp2_neg_f32::<FMA>(t)
+    }
+    #[inline(always)]
+    fn exp<const FMA: bool>(x: Self) -> Self {
+        exp_f32::<FMA>(x)
     }
 }
 
@@ -190,12 +203,49 @@ fn exp2_neg_f32<const FMA: bool>(t: f32) -> f32 {
     let t = t.least(115.0);
     let shifted = ROUND - t;
     let g = t + (shifted - ROUND);
+    // The low bits of `shifted` are n; added to the exponent they multiply by 2^n.
+    f32::from_bits(
+        polynomial::<FMA>(g)
+            .to_bits()
+            .wrapping_add(shifted.to_bits() << 23),
+    )
+}
+
+/// `2^-g` for `|g| <= 1/2`.
+#[inline(always)]
+fn polynomial<const FMA: bool>(g: f32) -> f32 {
     let mut p = EXP2[0];
     for coefficient in &EXP2[1..] {
         p = f32::multiply_add::<FMA>(p, g, *coefficient);
     }
-    // The low bits of `shifted` are n; added to the exponent they multiply by 2^n.
-    f32::from_bits(p.to_bits().wrapping_add(shifted.to_bits() << 23))
+    p
+}
+
+/// `exp(x) = 2^n 2^-g` for any x, with the same polynomial: infinite and zero where that is out of range, NaN for NaN.
+#[inline(always)]
+fn exp_f32<const FMA: bool>(x: f32) -> f32 {
+    // ln(2) in two parts; the first has so few bits that n * LN2_HIGH is exact.
+    const LN2_HIGH: f32 = 0.693_359_4;
+    const LN2_LOW: f32 = -2.121_944_4e-4;
+    let multiply_add = f32::multiply_add::<FMA>;
+
+    // Beyond these the result is infinite or zero anyway. Written so that NaN passes both.
+    let low = if x < -104.0 { -104.0 } else { x };
+    let x = if low > 89.0 { 89.0 } else { low };
+    let shifted = multiply_add(x, core::f32::consts::LOG2_E, ROUND);
+    let n = shifted - ROUND;
+    let r = multiply_add(-n, LN2_LOW, multiply_add(-n, LN2_HIGH, x));
+    let p = polynomial::<FMA>(r * -core::f32::consts::LOG2_E);
+    // n may be 128, or -150: neither is the exponent of a normal number, but those of its halves are.
+    let n = (shifted.to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32);
+    let half = n >> 1;
+    p * two_to(half) * two_to(n.wrapping_sub(half))
+}
+
+/// `2^n` of a small n: moved into the exponent.
+#[inline(always)]
+fn two_to(n: i32) -> f32 {
+    f32::from_bits(((n << 23) as u32).wrapping_add(1.0f32.to_bits()))
 }
 
 #[cfg(test)]
@@ -214,6 +264,44 @@ mod tests {
         assert!(f32::exp2_neg::<FMA>(1e9) < 1e-30);
         assert!(f32::exp2_neg::<FMA>(f32::NAN) < 1e-30);
         assert_eq!(f32::exp2_neg::<FMA>(0.0), 1.0);
+    }
+
+    fn check_anywhere<const FMA: bool>() {
+        let mut worst = 0.0f64;
+        for i in -8_700_000..=8_870_000 {
+            let x = i as f32 * 1e-5;
+            let exact = f64::from(x).exp();
+            worst = worst.max((f64::from(<f32 as Real>::exp::<FMA>(x)) / exact - 1.0).abs());
+        }
+        println!("fused: {FMA}, worst relative error {worst:e}");
+        assert!(worst < 2e-7, "worst relative error {worst:e}");
+        // Numbers below the normal ones have fewer digits, and then none.
+        for x in [
+            -88.0f32,
+            -95.0,
+            -103.0,
+            -103.9,
+            -105.0,
+            -1e30,
+            f32::NEG_INFINITY,
+        ] {
+            let error = f64::from(<f32 as Real>::exp::<FMA>(x)) - f64::from(x).exp();
+            assert!(
+                error.abs() <= 1.5 * f64::from(f32::from_bits(1)),
+                "{x}: {error:e}"
+            );
+        }
+        assert_eq!(<f32 as Real>::exp::<FMA>(0.0), 1.0);
+        for x in [88.73, 89.0, 1e30, f32::INFINITY] {
+            assert_eq!(<f32 as Real>::exp::<FMA>(x), f32::INFINITY, "{x}");
+        }
+        assert!(<f32 as Real>::exp::<FMA>(f32::NAN).is_nan());
+    }
+
+    #[test]
+    fn exp_is_exact_to_two_ulp_anywhere() {
+        check_anywhere::<true>();
+        check_anywhere::<false>();
     }
 
     #[test]

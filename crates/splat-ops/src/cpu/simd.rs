@@ -47,3 +47,10 @@ pub(super) fn prefetch<V>(items: &[V], index: Option<&u32>) {
     #[cfg(not(target_arch = "x86_64"))]
     let _ = (items, index);
 }
+
+/// Rows that are worked on together. Large enough for any register, small enough for dozens of columns in the first-level
+/// cache.
+pub(super) const LANES: usize = 32;
+
+/// One number of each of [`LANES`] rows. A loop over lanes, without branches and calls, becomes SIMD code.
+pub(super) type Lanes<T> = [T; LANES];

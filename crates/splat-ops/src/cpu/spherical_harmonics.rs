@@ -9,11 +9,11 @@ use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
 use super::buffer::{Buffer, overwritten, tensor};
-use super::math::{Vec3, dot, scale};
+use super::math::{Vec3, dot, largest, over, scale};
 use super::real::Real;
 use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
 
-const COUNT_MAX: usize = sh_coefficient_count(SH_DEGREE_MAX);
+pub(super) const COUNT_MAX: usize = sh_coefficient_count(SH_DEGREE_MAX);
 /// Gaussians per unit of parallel work.
 const CHUNK: usize = 512;
 
@@ -34,7 +34,7 @@ const C3: [f64; 5] = [
 
 /// Values of the first `(degree + 1)^2` basis functions in a unit direction; the rest is zero.
 #[inline(always)]
-fn basis<T: Real>(degree: usize, [x, y, z]: Vec3<T>) -> [T; COUNT_MAX] {
+pub(super) fn basis<T: Real>(degree: usize, [x, y, z]: Vec3<T>) -> [T; COUNT_MAX] {
     let k = T::of;
     let mut b = [T::ZERO; COUNT_MAX];
     b[0] = k(C0);
@@ -65,7 +65,7 @@ fn basis<T: Real>(degree: usize, [x, y, z]: Vec3<T>) -> [T; COUNT_MAX] {
 
 /// Derivatives of [`basis`] by x, y and z.
 #[inline(always)]
-fn basis_gradient<T: Real>(degree: usize, [x, y, z]: Vec3<T>) -> [Vec3<T>; COUNT_MAX] {
+pub(super) fn basis_gradient<T: Real>(degree: usize, [x, y, z]: Vec3<T>) -> [Vec3<T>; COUNT_MAX] {
     let k = T::of;
     let o = T::ZERO;
     let mut d = [[o; 3]; COUNT_MAX];
@@ -117,14 +117,14 @@ fn basis_gradient<T: Real>(degree: usize, [x, y, z]: Vec3<T>) -> [Vec3<T>; COUNT
 
 /// Unit vector and one over the length; both zero for the zero vector.
 #[inline(always)]
-fn normalize<T: Real>(v: Vec3<T>) -> (Vec3<T>, T) {
-    let largest = v.iter().fold(T::ZERO, |m, x| m.greatest(x.abs()));
-    if !(largest > T::ZERO) {
-        return ([T::ZERO; 3], T::ZERO);
-    }
-    let scaled = v.map(|x| x / largest);
-    let length = dot(scaled, scaled).sqrt();
-    (scaled.map(|x| x / length), T::ONE / (length * largest))
+pub(super) fn normalize<T: Real>(v: Vec3<T>) -> (Vec3<T>, T) {
+    let largest = largest(v);
+    let [x, y, z] = over(v, largest);
+    let length = dot([x, y, z], [x, y, z]).sqrt();
+    let known = largest > T::ZERO;
+    let kept = |value: T| if known { value } else { T::ZERO };
+    let unit = [kept(x / length), kept(y / length), kept(z / length)];
+    (unit, kept(T::ONE / (length * largest)))
 }
 
 fn direction<T: Real>(dirs: &[T], row: usize) -> Vec3<T> {
@@ -162,14 +162,14 @@ pub(super) fn forward<T: Real>(
 /// Nothing was seen of it: the rule for most splats of most views. Zero times NaN must not come out of one that is
 /// broken either; its gradient would reach the camera's.
 #[inline(always)]
-fn is_zero<T: Real>(grad: &[T]) -> bool {
+pub(super) fn is_zero<T: Real>(grad: &[T]) -> bool {
     grad.iter().all(|g| *g == T::ZERO)
 }
 
 /// `grad . coeff`, where a channel without gradient (black, and clamped there) does not look at its coefficient, which
 /// may be infinite.
 #[inline(always)]
-fn guarded_dot<T: Real>(grad: Vec3<T>, coeff: &[T]) -> T {
+pub(super) fn guarded_dot<T: Real>(grad: Vec3<T>, coeff: &[T]) -> T {
     let mut sum = T::ZERO;
     for (grad, coeff) in grad.into_iter().zip(coeff) {
         sum += if grad == T::ZERO {

@@ -1,8 +1,12 @@
 //! What must hold on every backend: the native path, and the kernels where there is an adapter.
 
+mod activation;
 mod decisions;
 mod photometric;
 mod poison;
+mod probe;
+mod screen_statistics;
+mod sh_colors;
 
 use burn::tensor::Device;
 

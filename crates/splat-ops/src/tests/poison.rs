@@ -7,8 +7,9 @@ use rand_pcg::Pcg32;
 
 use super::devices;
 use crate::{
-    AdamStep, ImageSize, ProjectSettings, RasterizeSettings, SsimArgs, adam_step, gaussian_blur,
-    photometric, project, rasterize, spherical_harmonics, ssim_map,
+    AdamRows, AdamStep, ImageSize, ProjectSettings, RasterizeSettings, SsimArgs, adam_step, exp,
+    gaussian_blur, photometric, project, rasterize, sh_colors, sigmoid, spherical_harmonics,
+    ssim_map,
 };
 
 fn poison(on: bool) {
@@ -72,6 +73,21 @@ impl Scene {
         )
         .unwrap();
         let harmonics = spherical_harmonics(coeffs.clone(), dirs.clone(), 3).unwrap();
+        let [sh0, sh_rest] = [(0, 1), (1, 15)].map(|(start, count)| {
+            let part = coeffs.clone().inner().narrow(1, start, count);
+            Tensor::from_inner(part).require_grad()
+        });
+        let centers = leaf(uniform(&[c, 3], -1.0, 1.0));
+        let seen = sh_colors(
+            sh0.clone(),
+            Some(sh_rest.clone()),
+            means.clone(),
+            centers.clone(),
+            3,
+        )
+        .unwrap();
+        let logits = leaf(uniform(&[c, n], -9.0, 9.0));
+        let activated = [exp(logits.clone()), sigmoid(logits.clone())];
         let rendered = rasterize(
             &projected,
             colors.clone(),
@@ -93,7 +109,10 @@ impl Scene {
         let mut loss = blurred.clone().square().sum() + similarity.clone().square().sum();
         loss = loss + averages.clone().square().sum();
         if n > 0 {
-            loss = loss + harmonics.clone().square().sum();
+            loss = loss + harmonics.clone().square().sum() + seen.clone().square().sum();
+            for activated in &activated {
+                loss = loss + activated.clone().square().sum();
+            }
         }
         let grads = loss.backward();
 
@@ -105,6 +124,7 @@ impl Scene {
         let mut found = vec![
             ("projected", bits(projected.packed().into_data())),
             ("harmonics", bits(harmonics.into_data())),
+            ("seen", bits(seen.into_data())),
             ("rendered", bits(rendered.packed().into_data())),
             ("blurred", bits(blurred.into_data())),
             ("similarity", bits(similarity.into_data())),
@@ -117,6 +137,8 @@ impl Scene {
             ("intrinsics", &intrinsics),
             ("opacities", &opacities),
             ("background", &background),
+            ("centers", &centers),
+            ("logits", &logits),
         ] {
             if let Some(grad) = leaf.grad(&grads) {
                 found.push((name, bits(grad.into_data())));
@@ -127,6 +149,8 @@ impl Scene {
             ("colors", &colors),
             ("coeffs", &coeffs),
             ("dirs", &dirs),
+            ("sh0", &sh0),
+            ("sh_rest", &sh_rest),
         ] {
             if let Some(grad) = leaf.grad(&grads) {
                 found.push((name, bits(grad.into_data())));
@@ -137,10 +161,12 @@ impl Scene {
             beta_2: 0.999,
             rate: 0.1,
             epsilon: 1e-8,
+            rows: AdamRows::All,
         };
         let background = background.inner();
         let moments = [background.clone(), background.clone()];
         let (stepped, moments) = adam_step(background.clone(), background, moments, &step).unwrap();
+        found.extend(activated.map(|activated| ("activated", bits(activated.into_data()))));
         found.push(("stepped", bits(stepped.into_data())));
         found.extend(moments.map(|moment| ("moment", bits(moment.into_data()))));
         found
@@ -171,12 +197,12 @@ fn reserved_memory_is_written_before_it_is_read() {
             let poisoned = scene.run(&device);
             poison(false);
             let case = format!("{name}: C = {cameras}, N = {gaussians}, D = {channels}");
-            // With no splats some gradients are of nothing; otherwise all ten are there.
-            assert!(gaussians == 0 || clean.len() == 19, "{case}");
+            // With no splats some gradients are of nothing; otherwise all of them are there.
+            assert!(gaussians == 0 || clean.len() == 26, "{case}");
             for ((part, clean), (_, poisoned)) in clean.iter().zip(&poisoned) {
                 assert!(clean == poisoned, "{case}: {part} differs");
             }
-            let alpha = &clean[2].1;
+            let alpha = &clean[3].1;
             assert!(
                 gaussians < 10 || scale > 0.1 || alpha.contains(&0),
                 "{case}"

@@ -480,7 +480,8 @@ impl Trainer {
             .config
             .rates
             .at(step, self.config.steps, self.run.scene_scale);
-        let gaussians = self.gaussians.clone();
+        // Out of its place: the optimiser writes into memory that nothing else holds, and copies the rest.
+        let gaussians = std::mem::replace(&mut self.gaussians, Gaussians::empty(&self.device));
         self.gaussians = self.state.optimizer.step(rates, gaussians, grads);
         drop(optimizer);
 
@@ -494,7 +495,8 @@ impl Trainer {
         self.state.step += 1;
         let _density = trace_span!("density").entered();
         if let Some(gradient) = screen_gradient {
-            self.state.density.observe(gradient, extents, cameras.size);
+            let density = &mut self.state.density;
+            density.observe(gradient, extents, cameras.size)?;
         }
         // What would be added after the last step would never be trained.
         if self.state.step < self.config.steps {

@@ -1,4 +1,4 @@
-//! Ops composed of Burn's tensor ops, for backends that have nothing of their own.
+//! The loss, and structural similarity.
 
 use core::ops::Range;
 

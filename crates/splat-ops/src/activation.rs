@@ -1,0 +1,37 @@
+//! The activations of scales and opacities (3DGS section 5.1).
+
+use burn::backend::Dispatch;
+use burn::tensor::Tensor;
+
+use crate::backend::SplatOps;
+
+/// A function of one element.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Activation {
+    /// `exp(x)`.
+    Exp,
+    /// `1 / (1 + exp(-x))`.
+    Sigmoid,
+}
+
+/// `exp(x)`, of logarithms of scales for example. The same function as [`Tensor::exp`]; on the CPU in SIMD and parallel,
+/// to 2 units in the last place.
+pub fn exp<const D: usize>(x: Tensor<D>) -> Tensor<D> {
+    activate(x, Activation::Exp)
+}
+
+/// The logistic function `1 / (1 + exp(-x))`, of opacity logits for example.
+///
+/// Its gradient is computed from x, as `e / (1 + e)^2` with `e = exp(-|x|)`. Burn's own takes it from the output, as
+/// `o (1 - o)`, which is exactly zero once o rounds to one (from a logit of 17 on in single precision): a Gaussian could
+/// never become transparent again.
+pub fn sigmoid<const D: usize>(x: Tensor<D>) -> Tensor<D> {
+    activate(x, Activation::Sigmoid)
+}
+
+fn activate<const D: usize>(x: Tensor<D>, function: Activation) -> Tensor<D> {
+    Tensor::from_dispatch(<Dispatch as SplatOps>::activation(
+        x.into_dispatch(),
+        function,
+    ))
+}

@@ -1,0 +1,92 @@
+//! `exp`, the logistic function, and their gradients, element by element.
+
+use core::marker::PhantomData;
+
+use burn::backend::TensorMetadata;
+use burn::backend::flex::FlexTensor;
+use burn::tensor::TensorData;
+use rayon::prelude::*;
+
+use super::buffer::{Buffer, overwritten};
+use super::real::Real;
+use super::simd::vectorized;
+use crate::activation::Activation;
+
+/// Elements per unit of parallel work.
+const CHUNK: usize = 8192;
+
+pub(super) fn forward<T: Real>(
+    _: PhantomData<T>,
+    x: FlexTensor,
+    function: Activation,
+) -> FlexTensor {
+    let shape = x.shape();
+    let x = Buffer::new(x);
+    let mut y = overwritten::<T>(shape.num_elements());
+    y.par_chunks_mut(CHUNK)
+        .zip(x.slice::<T>().par_chunks(CHUNK))
+        .for_each(|(y, x)| match function {
+            Activation::Exp => exp(x, y),
+            Activation::Sigmoid => sigmoid(x, y),
+        });
+    FlexTensor::from_data(TensorData::new(y, shape))
+}
+
+pub(super) fn backward<T: Real>(
+    _: PhantomData<T>,
+    x: FlexTensor,
+    y: FlexTensor,
+    grad: FlexTensor,
+    function: Activation,
+) -> FlexTensor {
+    let shape = x.shape();
+    let (x, y, grad) = (Buffer::new(x), Buffer::new(y), Buffer::new(grad));
+    let mut out = overwritten::<T>(shape.num_elements());
+    out.par_chunks_mut(CHUNK)
+        .zip(x.slice::<T>().par_chunks(CHUNK))
+        .zip(y.slice::<T>().par_chunks(CHUNK))
+        .zip(grad.slice::<T>().par_chunks(CHUNK))
+        .for_each(|(((out, x), y), grad)| match function {
+            Activation::Exp => multiply(grad, y, out),
+            Activation::Sigmoid => sigmoid_backward(x, grad, out),
+        });
+    FlexTensor::from_data(TensorData::new(out, shape))
+}
+
+vectorized! {
+    fn exp<T: Real, const FMA: bool>(x: &[T], y: &mut [T]) {
+        for (y, x) in y.iter_mut().zip(x) {
+            *y = T::exp::<FMA>(*x);
+        }
+    }
+}
+
+vectorized! {
+    /// `exp(min(x, 0)) / (1 + exp(-|x|))`: one exponential is 1 or the other.
+    fn sigmoid<T: Real, const FMA: bool>(x: &[T], y: &mut [T]) {
+        for (y, x) in y.iter_mut().zip(x) {
+            let small = T::exp::<FMA>(-x.abs());
+            let above = if *x < T::ZERO { small } else { T::ONE };
+            *y = above / (T::ONE + small);
+        }
+    }
+}
+
+vectorized! {
+    /// `e / (1 + e)^2` with `e = exp(-|x|)`: no digit is lost at either end.
+    fn sigmoid_backward<T: Real, const FMA: bool>(x: &[T], grad: &[T], out: &mut [T]) {
+        for ((out, x), grad) in out.iter_mut().zip(x).zip(grad) {
+            let small = T::exp::<FMA>(-x.abs());
+            let one = T::ONE + small;
+            *out = *grad * (small / one / one);
+        }
+    }
+}
+
+vectorized! {
+    fn multiply<T: Real, const FMA: bool>(a: &[T], b: &[T], out: &mut [T]) {
+        for ((out, a), b) in out.iter_mut().zip(a).zip(b) {
+            *out = *a * *b;
+        }
+    }
+}

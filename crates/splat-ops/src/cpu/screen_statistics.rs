@@ -1,0 +1,77 @@
+//! Sums of screen gradients, in one pass and in place.
+
+use core::marker::PhantomData;
+
+use burn::backend::TensorMetadata;
+use burn::backend::flex::FlexTensor;
+use rayon::prelude::*;
+
+use super::buffer::BufferMut;
+use super::real::Real;
+
+/// Gaussians per unit of parallel work, at least.
+const CHUNK: usize = 4096;
+
+/// `[C, N, 2]`, read where it lies: usually two columns of packed splats.
+struct Pairs<'a, T> {
+    values: &'a [T],
+    start: usize,
+    strides: [usize; 3],
+}
+
+impl<'a, T: Real> Pairs<'a, T> {
+    fn new(tensor: &'a FlexTensor) -> Self {
+        let layout = tensor.layout();
+        let stride = |axis: usize| layout.strides()[axis] as usize;
+        Self {
+            values: tensor.storage(),
+            start: layout.start_offset(),
+            strides: [stride(0), stride(1), stride(2)],
+        }
+    }
+
+    #[inline(always)]
+    fn at(&self, c: usize, n: usize, i: usize) -> T {
+        self.values[self.start + c * self.strides[0] + n * self.strides[1] + i * self.strides[2]]
+    }
+}
+
+pub(super) fn add<T: Real>(
+    _: PhantomData<T>,
+    [gradient, extents, gradients, views]: [FlexTensor; 4],
+    half: [f64; 2],
+) -> [FlexTensor; 2] {
+    let cameras = gradient.shape()[0];
+    // A flipped view would have strides below zero.
+    let [gradient, extents] = [gradient, extents].map(|tensor| {
+        if tensor.layout().strides().iter().any(|stride| *stride < 0) {
+            tensor.to_contiguous()
+        } else {
+            tensor
+        }
+    });
+    let (gradient, extents) = (Pairs::<T>::new(&gradient), Pairs::<T>::new(&extents));
+    let [width, height] = half.map(T::of);
+    let mut sums = [gradients, views].map(BufferMut::new);
+    let [gradients, views] = sums.each_mut().map(|buffer| buffer.slice::<T>());
+    gradients
+        .par_iter_mut()
+        .zip(views)
+        .enumerate()
+        .with_min_len(CHUNK)
+        .for_each(|(n, (total, views))| {
+            let (mut sum, mut count) = (T::ZERO, T::ZERO);
+            for c in 0..cameras {
+                if extents.at(c, n, 0) > T::ZERO {
+                    let (x, y) = (gradient.at(c, n, 0) * width, gradient.at(c, n, 1) * height);
+                    let length = (x * x + y * y).sqrt();
+                    // What is not finite must not hide the other views of the same Gaussian.
+                    sum += if length.is_finite() { length } else { T::ZERO };
+                    count += T::ONE;
+                }
+            }
+            *total += sum;
+            *views += count;
+        });
+    sums.map(BufferMut::into_tensor)
+}

@@ -1,0 +1,400 @@
+//! Colours in the directions of the cameras, `max(SH(mean - centre) + 0.5, 0)`, and their gradient.
+//!
+//! Directions and basis functions are the same arithmetic for every Gaussian: in columns, as SIMD code. Coefficients lie
+//! in rows, and are read and written there.
+
+use core::marker::PhantomData;
+use core::ops::Range;
+
+use burn::backend::Flex;
+use burn::backend::flex::FlexTensor;
+use rayon::prelude::*;
+
+use super::buffer::{Buffer, overwritten, tensor};
+use super::math::{Vec3, dot};
+use super::real::Real;
+use super::simd::{LANES, Lanes, vectorized};
+use super::spherical_harmonics::{
+    COUNT_MAX, basis, basis_gradient, guarded_dot, is_zero, normalize,
+};
+use crate::backend::ShInputs;
+use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
+
+/// Gaussians per unit of parallel work. Fixed, so that sums over Gaussians have a fixed order.
+const CHUNK: usize = 512;
+
+/// The four inputs.
+struct Tensors {
+    sh0: Buffer,
+    sh_rest: Option<Buffer>,
+    means: Buffer,
+    centers: Buffer,
+}
+
+impl Tensors {
+    fn new(inputs: ShInputs<Flex>) -> Self {
+        Self {
+            sh0: Buffer::new(inputs.sh0),
+            sh_rest: inputs.sh_rest.map(Buffer::new),
+            means: Buffer::new(inputs.means),
+            centers: Buffer::new(inputs.centers),
+        }
+    }
+
+    fn slices<T: Real>(&self, degree: usize) -> Inputs<'_, T> {
+        Inputs {
+            sh0: self.sh0.slice(),
+            rest: self.sh_rest.as_ref().map_or(&[], |rest| rest.slice()),
+            stored: self.sh_rest.as_ref().map_or(0, |rest| rest.dims::<3>()[1]),
+            means: self.means.slice(),
+            centers: self.centers.slice(),
+            degree,
+        }
+    }
+}
+
+/// The four inputs as slices.
+struct Inputs<'a, T> {
+    sh0: &'a [T],
+    rest: &'a [T],
+    /// R.
+    stored: usize,
+    means: &'a [T],
+    centers: &'a [T],
+    degree: usize,
+}
+
+impl<'a, T: Real> Inputs<'a, T> {
+    fn count(&self) -> usize {
+        self.means.len() / 3
+    }
+
+    /// Coefficients of one Gaussian that the degree reads, without the first.
+    fn rest(&self, n: usize) -> &'a [T] {
+        let used = sh_coefficient_count(self.degree) - 1;
+        &self.rest[3 * self.stored * n..][..3 * used]
+    }
+
+    fn sh0(&self, n: usize) -> &'a [T] {
+        &self.sh0[3 * n..3 * n + 3]
+    }
+
+    /// Means of up to [`LANES`] Gaussians, seen from a centre.
+    fn directions(&self, rows: impl Iterator<Item = usize>, center: &[T]) -> [Lanes<T>; 3] {
+        let mut columns = [[T::ZERO; LANES]; 3];
+        for (lane, n) in rows.enumerate() {
+            let mean = &self.means[3 * n..3 * n + 3];
+            for (column, (mean, center)) in columns.iter_mut().zip(mean.iter().zip(center)) {
+                column[lane] = *mean - *center;
+            }
+        }
+        columns
+    }
+
+    /// The colour before the clamp, given the basis in the direction of the Gaussian.
+    #[inline(always)]
+    fn color(&self, n: usize, basis: &[Lanes<T>; COUNT_MAX], lane: usize) -> Vec3<T> {
+        let sh0 = self.sh0(n);
+        let first = basis[0][lane];
+        let mut color = [first * sh0[0], first * sh0[1], first * sh0[2]];
+        for (coeff, basis) in self.rest(n).chunks_exact(3).zip(&basis[1..]) {
+            let value = basis[lane];
+            color[0] += value * coeff[0];
+            color[1] += value * coeff[1];
+            color[2] += value * coeff[2];
+        }
+        let half = T::of(0.5);
+        [color[0] + half, color[1] + half, color[2] + half]
+    }
+}
+
+vectorized! {
+    /// Unit directions and one over their lengths, and the basis functions in them.
+    fn evaluate<T: Real, const FMA: bool>(
+        degree: usize,
+        directions: &[Lanes<T>; 3],
+        units: &mut [Lanes<T>; 4],
+        values: &mut [Lanes<T>; COUNT_MAX],
+    ) {
+        // One loop per degree, without a branch in it.
+        match degree {
+            0 => evaluate_degree::<T, 0>(directions, units, values),
+            1 => evaluate_degree::<T, 1>(directions, units, values),
+            2 => evaluate_degree::<T, 2>(directions, units, values),
+            _ => evaluate_degree::<T, SH_DEGREE_MAX>(directions, units, values),
+        }
+    }
+}
+
+#[inline(always)]
+fn evaluate_degree<T: Real, const DEGREE: usize>(
+    directions: &[Lanes<T>; 3],
+    units: &mut [Lanes<T>; 4],
+    values: &mut [Lanes<T>; COUNT_MAX],
+) {
+    for lane in 0..LANES {
+        let at = |axis: usize| directions[axis][lane];
+        let (unit, inverse) = normalize([at(0), at(1), at(2)]);
+        units[0][lane] = unit[0];
+        units[1][lane] = unit[1];
+        units[2][lane] = unit[2];
+        units[3][lane] = inverse;
+        let basis = basis(DEGREE, unit);
+        for i in 0..sh_coefficient_count(DEGREE) {
+            values[i][lane] = basis[i];
+        }
+    }
+}
+
+vectorized! {
+    /// Gradients of the directions, given `weights`, those of the basis functions. d = v / |v|: the gradient of v is what
+    /// is tangential, divided by |v|.
+    fn evaluate_backward<T: Real, const FMA: bool>(
+        degree: usize,
+        units: &[Lanes<T>; 4],
+        weights: &[Lanes<T>; COUNT_MAX],
+        gradients: &mut [Lanes<T>; 3],
+    ) {
+        match degree {
+            0 => (),
+            1 => evaluate_degree_backward::<T, 1>(units, weights, gradients),
+            2 => evaluate_degree_backward::<T, 2>(units, weights, gradients),
+            _ => evaluate_degree_backward::<T, SH_DEGREE_MAX>(units, weights, gradients),
+        }
+    }
+}
+
+#[inline(always)]
+fn evaluate_degree_backward<T: Real, const DEGREE: usize>(
+    units: &[Lanes<T>; 4],
+    weights: &[Lanes<T>; COUNT_MAX],
+    gradients: &mut [Lanes<T>; 3],
+) {
+    for lane in 0..LANES {
+        let unit = [units[0][lane], units[1][lane], units[2][lane]];
+        let slopes = basis_gradient(DEGREE, unit);
+        let mut sum = [T::ZERO; 3];
+        for i in 1..sh_coefficient_count(DEGREE) {
+            let weight = weights[i][lane];
+            sum[0] += weight * slopes[i][0];
+            sum[1] += weight * slopes[i][1];
+            sum[2] += weight * slopes[i][2];
+        }
+        let radial = dot(sum, unit);
+        let inverse = units[3][lane];
+        gradients[0][lane] = (sum[0] - unit[0] * radial) * inverse;
+        gradients[1][lane] = (sum[1] - unit[1] * radial) * inverse;
+        gradients[2][lane] = (sum[2] - unit[2] * radial) * inverse;
+    }
+}
+
+pub(super) fn forward<T: Real>(
+    _: PhantomData<T>,
+    inputs: ShInputs<Flex>,
+    degree: usize,
+) -> FlexTensor {
+    let tensors = Tensors::new(inputs);
+    let inputs = tensors.slices::<T>(degree);
+    let (c, n) = (inputs.centers.len() / 3, inputs.count());
+    let mut colors = overwritten::<T>(c * n * 3);
+    if n > 0 {
+        let views = colors.chunks_exact_mut(n * 3);
+        for (center, colors) in inputs.centers.chunks_exact(3).zip(views) {
+            colors
+                .par_chunks_mut(3 * LANES)
+                .with_min_len(CHUNK / LANES)
+                .enumerate()
+                .for_each(|(block, colors)| {
+                    let first = block * LANES;
+                    let rows = first..first + colors.len() / 3;
+                    let directions = inputs.directions(rows.clone(), center);
+                    let mut units = [[T::ZERO; LANES]; 4];
+                    let mut basis = [[T::ZERO; LANES]; COUNT_MAX];
+                    evaluate(degree, &directions, &mut units, &mut basis);
+                    for (lane, (n, out)) in rows.zip(colors.chunks_exact_mut(3)).enumerate() {
+                        let color = inputs.color(n, &basis, lane);
+                        for (out, value) in out.iter_mut().zip(color) {
+                            // NaN stays.
+                            *out = if value < T::ZERO { T::ZERO } else { value };
+                        }
+                    }
+                });
+        }
+    }
+    tensor(colors, [c, n, 3])
+}
+
+/// The gradients of one chunk of Gaussians, where they belong; those that are not wanted are empty.
+struct Chunk<'a, T> {
+    rows: Range<usize>,
+    sh0: &'a mut [T],
+    rest: &'a mut [T],
+    means: &'a mut [T],
+    /// Whether the means' or the centres' are wanted.
+    directions: bool,
+}
+
+impl<T: Real> Chunk<'_, T> {
+    /// Adds the gradients through one camera, given those of its colours; returns that of its centre.
+    fn add(&mut self, inputs: &Inputs<T>, center: &[T], grad: &[T]) -> Vec3<T> {
+        let mut of_center = [T::ZERO; 3];
+        let mut block = [0; LANES];
+        let mut count = 0;
+        for row in self.rows.clone() {
+            if !is_zero(&grad[3 * row..3 * row + 3]) {
+                block[count] = row;
+                count += 1;
+            }
+            if count == LANES {
+                self.add_block(&block, inputs, center, grad, &mut of_center);
+                count = 0;
+            }
+        }
+        self.add_block(&block[..count], inputs, center, grad, &mut of_center);
+        of_center
+    }
+
+    fn add_block(
+        &mut self,
+        rows: &[usize],
+        inputs: &Inputs<T>,
+        center: &[T],
+        grad: &[T],
+        of_center: &mut Vec3<T>,
+    ) {
+        let mut units = [[T::ZERO; LANES]; 4];
+        let mut basis = [[T::ZERO; LANES]; COUNT_MAX];
+        let directions = inputs.directions(rows.iter().copied(), center);
+        evaluate(inputs.degree, &directions, &mut units, &mut basis);
+
+        let mut weights = [[T::ZERO; LANES]; COUNT_MAX];
+        for (lane, n) in rows.iter().enumerate() {
+            let color = inputs.color(*n, &basis, lane);
+            let mut grad = [grad[3 * n], grad[3 * n + 1], grad[3 * n + 2]];
+            for (grad, color) in grad.iter_mut().zip(color) {
+                if color < T::ZERO {
+                    *grad = T::ZERO;
+                }
+            }
+            self.add_coefficients(*n, inputs, &basis, lane, grad);
+            if self.directions {
+                let coeffs = inputs.rest(*n).chunks_exact(3);
+                for (weight, coeff) in weights[1..].iter_mut().zip(coeffs) {
+                    weight[lane] = guarded_dot(grad, coeff);
+                }
+            }
+        }
+        if !self.directions {
+            return;
+        }
+        let mut gradients = [[T::ZERO; LANES]; 3];
+        evaluate_backward(inputs.degree, &units, &weights, &mut gradients);
+        for (lane, n) in rows.iter().enumerate() {
+            for axis in 0..3 {
+                of_center[axis] -= gradients[axis][lane];
+            }
+            if !self.means.is_empty() {
+                let i = 3 * (n - self.rows.start);
+                for (mean, gradient) in self.means[i..i + 3].iter_mut().zip(&gradients) {
+                    *mean += gradient[lane];
+                }
+            }
+        }
+    }
+
+    /// A coefficient's gradient is its basis function times the colour's.
+    #[inline(always)]
+    fn add_coefficients(
+        &mut self,
+        n: usize,
+        inputs: &Inputs<T>,
+        basis: &[Lanes<T>; COUNT_MAX],
+        lane: usize,
+        grad: Vec3<T>,
+    ) {
+        let i = n - self.rows.start;
+        if !self.sh0.is_empty() {
+            let sh0 = &mut self.sh0[3 * i..3 * i + 3];
+            for (sum, grad) in sh0.iter_mut().zip(grad) {
+                *sum += basis[0][lane] * grad;
+            }
+        }
+        if !self.rest.is_empty() {
+            let used = inputs.rest(n).len();
+            let rest = &mut self.rest[3 * inputs.stored * i..][..used];
+            for (sums, basis) in rest.chunks_exact_mut(3).zip(&basis[1..]) {
+                let value = basis[lane];
+                sums[0] += value * grad[0];
+                sums[1] += value * grad[1];
+                sums[2] += value * grad[2];
+            }
+        }
+    }
+}
+
+pub(super) fn backward<T: Real>(
+    _: PhantomData<T>,
+    inputs: ShInputs<Flex>,
+    grad: FlexTensor,
+    degree: usize,
+    wanted: [bool; 4],
+) -> [Option<FlexTensor>; 4] {
+    let tensors = Tensors::new(inputs);
+    let inputs = tensors.slices::<T>(degree);
+    let grad = Buffer::new(grad);
+    let grad = grad.slice::<T>();
+    let (c, n) = (inputs.centers.len() / 3, inputs.count());
+
+    let zeros = |wanted: bool, width: usize| vec![T::ZERO; if wanted { n * width } else { 0 }];
+    let mut sh0 = zeros(wanted[0], 3);
+    let mut rest = zeros(wanted[1], 3 * inputs.stored);
+    let mut means = zeros(wanted[2], 3);
+    let mut parts = [
+        slabs(&mut sh0, n, 3),
+        slabs(&mut rest, n, 3 * inputs.stored),
+        slabs(&mut means, n, 3),
+    ]
+    .map(Vec::into_iter);
+    let chunks: Vec<Chunk<T>> = (0..n.div_ceil(CHUNK))
+        .map(|chunk| {
+            let [sh0, rest, means] = parts.each_mut().map(|part| part.next().unwrap_or_default());
+            Chunk {
+                rows: chunk * CHUNK..n.min((chunk + 1) * CHUNK),
+                sh0,
+                rest,
+                means,
+                directions: wanted[2] || wanted[3],
+            }
+        })
+        .collect();
+    let of_centers: Vec<Vec<Vec3<T>>> = chunks
+        .into_par_iter()
+        .map(|mut chunk| {
+            let views = inputs.centers.chunks_exact(3).zip(grad.chunks_exact(3 * n));
+            views
+                .map(|(center, grad)| chunk.add(&inputs, center, grad))
+                .collect()
+        })
+        .collect();
+
+    let mut centers = vec![T::ZERO; 3 * c];
+    for chunk in &of_centers {
+        for (sum, value) in centers.iter_mut().zip(chunk.as_flattened()) {
+            *sum += *value;
+        }
+    }
+    [
+        wanted[0].then(|| tensor(sh0, [n, 1, 3])),
+        wanted[1].then(|| tensor(rest, [n, inputs.stored, 3])),
+        wanted[2].then(|| tensor(means, [n, 3])),
+        wanted[3].then(|| tensor(centers, [c, 3])),
+    ]
+}
+
+/// The rows of each chunk of Gaussians.
+fn slabs<T>(values: &mut [T], n: usize, width: usize) -> Vec<&mut [T]> {
+    if values.len() < n * width {
+        return Vec::new();
+    }
+    values.chunks_mut((CHUNK * width).max(1)).collect()
+}

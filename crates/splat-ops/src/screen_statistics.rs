@@ -1,0 +1,53 @@
+//! What density control wants to know of every step (3DGS section 5.2).
+
+use burn::backend::Dispatch;
+use burn::tensor::Tensor;
+
+use crate::backend::SplatOps;
+use crate::check::Checker;
+use crate::{ImageSize, OpError};
+
+/// Sums over the views so far, per Gaussian.
+#[derive(Debug, Clone)]
+pub struct ScreenStatistics {
+    /// `[N]`: lengths of the gradients of the screen means, in half images, as gsplat measures them.
+    pub gradients: Tensor<1>,
+    /// `[N]`: views that saw the Gaussian.
+    pub views: Tensor<1>,
+}
+
+impl ScreenStatistics {
+    /// Adds a step: gradients of the screen means `[C, N, 2]` in 1 / pixels, of a loss that is a mean over C cameras, and
+    /// extents `[C, N, 2]`, positive where a camera sees the Gaussian. A gradient that is not finite counts as zero. On
+    /// the CPU one pass over memory, in place where nothing else holds the statistics. Not differentiable.
+    ///
+    /// # Errors
+    /// When shapes, types or devices do not fit.
+    pub fn add(
+        self,
+        gradient: Tensor<3>,
+        extents: Tensor<3>,
+        size: ImageSize,
+    ) -> Result<Self, OpError> {
+        let check = Checker::new("ScreenStatistics::add", "gradient", &gradient)?;
+        let [c, n, _] = gradient.dims();
+        let pairs = [Some(c), Some(n), Some(2)];
+        check.tensor("gradient", &gradient, pairs, "[C, N, 2]")?;
+        check.tensor("extents", &extents, pairs, "[C, N, 2]")?;
+        check.tensor("gradients", &self.gradients, [Some(n)], "[N]")?;
+        check.tensor("views", &self.views, [Some(n)], "[N]")?;
+        // Pixels to half images, and the mean over cameras to a sum.
+        let half = [size.width, size.height].map(|side| f64::from(side) / 2.0 * c as f64);
+        let sums = <Dispatch as SplatOps>::screen_statistics(
+            gradient.into_dispatch(),
+            extents.into_dispatch(),
+            self.gradients.into_dispatch(),
+            self.views.into_dispatch(),
+            half,
+        );
+        Ok(Self {
+            gradients: Tensor::from_dispatch(sums.gradients),
+            views: Tensor::from_dispatch(sums.views),
+        })
+    }
+}

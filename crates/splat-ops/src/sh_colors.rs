@@ -1,0 +1,66 @@
+//! Colours of Gaussians as cameras see them (3DGS section 4).
+
+use burn::backend::Dispatch;
+use burn::tensor::Tensor;
+
+use crate::backend::{Optional, SplatOps};
+use crate::check::Checker;
+use crate::{OpError, SH_DEGREE_MAX, sh_coefficient_count};
+
+/// Colours `[C, N, 3]` of N Gaussians in C cameras: `max(SH(mean - centre) + 0.5, 0)`, SH being
+/// [`spherical_harmonics`](crate::spherical_harmonics) of the coefficients `[sh0, sh_rest]`.
+///
+/// The same as that function between ordinary tensor ops, in one pass and without their copies.
+///
+/// # Arguments
+/// - `sh0` `[N, 1, 3]`: coefficients of degree 0.
+/// - `sh_rest` `[N, R, 3]` with 1 + R >= (degree + 1)^2: those of the higher degrees. What is beyond `degree` is not read
+///   and gets zero gradient; at degree 0 none of it is read, and it is no part of the graph.
+/// - `means` `[N, 3]`: world space.
+/// - `centers` `[C, 3]`: where the cameras stand.
+/// - `degree`: 0 to 3.
+///
+/// A channel that is clamped at zero passes no gradient on; one that is exactly zero does.
+///
+/// # Errors
+/// When the degree is above 3, or shapes, types or devices do not fit.
+pub fn sh_colors(
+    sh0: Tensor<3>,
+    sh_rest: Option<Tensor<3>>,
+    means: Tensor<2>,
+    centers: Tensor<2>,
+    degree: usize,
+) -> Result<Tensor<3>, OpError> {
+    let check = Checker::new("sh_colors", "sh0", &sh0)?;
+    let [n, _, _] = sh0.dims();
+    check.tensor("sh0", &sh0, [None, Some(1), Some(3)], "[N, 1, 3]")?;
+    check.tensor("means", &means, [Some(n), Some(3)], "[N, 3]")?;
+    check.tensor("centers", &centers, [None, Some(3)], "[C, 3]")?;
+    if let Some(rest) = &sh_rest {
+        check.tensor("sh_rest", rest, [Some(n), None, Some(3)], "[N, R, 3]")?;
+    }
+    if degree > SH_DEGREE_MAX {
+        return Err(check.argument(format!(
+            "degree {degree} is not available; the highest is {SH_DEGREE_MAX}"
+        )));
+    }
+    let stored = 1 + sh_rest.as_ref().map_or(0, |rest| rest.dims()[1]);
+    if stored < sh_coefficient_count(degree) {
+        return Err(check.argument(format!(
+            "degree {degree} needs {} coefficients, there are {stored}",
+            sh_coefficient_count(degree)
+        )));
+    }
+    let rest = match sh_rest {
+        Some(rest) if degree > 0 => Optional::Some(rest.into_dispatch()),
+        _ => Optional::None,
+    };
+    let colors = <Dispatch as SplatOps>::sh_colors(
+        sh0.into_dispatch(),
+        rest,
+        means.into_dispatch(),
+        centers.into_dispatch(),
+        degree,
+    );
+    Ok(Tensor::from_dispatch(colors))
+}

@@ -1,0 +1,154 @@
+//! `sh_colors` against the ops it is made of: values and all gradients, in double precision and on every device.
+
+use burn::tensor::{DType, Device, Tensor, TensorData};
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg32;
+
+use super::devices;
+use crate::{sh_coefficient_count, sh_colors, spherical_harmonics};
+
+/// Inputs as leaves: sh0, sh_rest, means, centres.
+struct Leaves {
+    sh0: Tensor<3>,
+    sh_rest: Tensor<3>,
+    means: Tensor<2>,
+    centers: Tensor<2>,
+}
+
+impl Leaves {
+    /// Some colours are far below zero, one exactly zero, the first mean is at the first camera's centre; every third
+    /// Gaussian is unseen (see [`weights`]), and the coefficients of one of those are not numbers.
+    fn new(c: usize, n: usize, device: &Device, dtype: DType) -> Self {
+        let mut rng = Pcg32::seed_from_u64(70);
+        let mut values =
+            |len: usize| -> Vec<f64> { (0..len).map(|_| rng.random_range(-1.0..1.0)).collect() };
+        let mut sh0 = values(n * 3);
+        let mut sh_rest = values(n * 15 * 3);
+        let (mut means, centers) = (values(n * 3), values(c * 3));
+        if n > 4 {
+            means[..3].copy_from_slice(&centers[..3]);
+            sh0[3..6].fill(-9.0);
+            sh_rest[2 * 45..3 * 45].fill(f64::NAN);
+            // Of a dark one a channel is exactly on the clamp at any degree.
+            sh0[3 * 4] = -0.5 / 0.282_094_791_773_878_14;
+            for k in 0..15 {
+                sh_rest[4 * 45 + 3 * k] = 0.0;
+            }
+        }
+        let data = |values: Vec<f64>, shape: &[usize]| TensorData::new(values, shape.to_vec());
+        let options = (device, dtype);
+        Self {
+            sh0: Tensor::from_data(data(sh0, &[n, 1, 3]), options).require_grad(),
+            sh_rest: Tensor::from_data(data(sh_rest, &[n, 15, 3]), options).require_grad(),
+            means: Tensor::from_data(data(means, &[n, 3]), options).require_grad(),
+            centers: Tensor::from_data(data(centers, &[c, 3]), options).require_grad(),
+        }
+    }
+
+    fn fused(&self, degree: usize) -> Tensor<3> {
+        let [sh0, rest] = [&self.sh0, &self.sh_rest].map(|x| x.clone());
+        sh_colors(
+            sh0,
+            Some(rest),
+            self.means.clone(),
+            self.centers.clone(),
+            degree,
+        )
+        .unwrap()
+    }
+
+    fn composed(&self, degree: usize) -> Tensor<3> {
+        let [n, _] = self.means.dims();
+        let [c, _] = self.centers.dims();
+        let coeffs = Tensor::cat(vec![self.sh0.clone(), self.sh_rest.clone()], 1);
+        let coeffs = coeffs.narrow(1, 0, sh_coefficient_count(degree));
+        let means = self.means.clone().reshape([1, -1, 3]).repeat_dim(0, c);
+        let centers = self.centers.clone().reshape([c, 1, 3]).repeat_dim(1, n);
+        let colors = spherical_harmonics(coeffs, means - centers, degree).unwrap();
+        (colors + 0.5).clamp_min(0.0)
+    }
+
+    /// Colours of what is seen, then the gradients that there are.
+    fn results(&self, colors: Tensor<3>) -> Vec<(&'static str, Vec<f64>)> {
+        let [c, n, _] = colors.dims();
+        let mut rng = Pcg32::seed_from_u64(71);
+        let weights: Vec<f64> = (0..c * n * 3)
+            .map(|i| {
+                let weight = rng.random_range(-1.0..1.0);
+                if i / 3 % n % 3 == 2 { 0.0 } else { weight }
+            })
+            .collect();
+        let options = (&colors.device(), colors.dtype());
+        let weights = Tensor::<3>::from_data(TensorData::new(weights, [c, n, 3]), options);
+        let seen = weights.clone().equal_elem(0.0);
+        let grads = (colors.clone().mask_fill(seen.clone(), 0.0) * weights)
+            .sum()
+            .backward();
+        let host = |data: TensorData| data.convert::<f64>().try_into_vec::<f64>().unwrap();
+        let mut found = vec![("colors", host(colors.mask_fill(seen, 0.0).into_data()))];
+        for (name, leaf) in [("sh0", &self.sh0), ("sh_rest", &self.sh_rest)] {
+            found.extend(leaf.grad(&grads).map(|grad| (name, host(grad.into_data()))));
+        }
+        for (name, leaf) in [("means", &self.means), ("centers", &self.centers)] {
+            found.extend(leaf.grad(&grads).map(|grad| (name, host(grad.into_data()))));
+        }
+        found
+    }
+}
+
+fn relative(a: &[f64], b: &[f64]) -> f64 {
+    let norm = |values: &mut dyn Iterator<Item = f64>| values.map(|x| x * x).sum::<f64>().sqrt();
+    let difference = norm(&mut a.iter().zip(b).map(|(a, b)| a - b));
+    difference / norm(&mut b.iter().copied()).max(f64::MIN_POSITIVE)
+}
+
+#[test]
+fn colors_and_gradients_are_those_of_the_composed_ops() {
+    let mut cases: Vec<_> = devices()
+        .into_iter()
+        .map(|(name, device)| (name, device, DType::F32, 1e-5))
+        .collect();
+    cases.push(("Flex f64", Device::flex(), DType::F64, 1e-12));
+    for (name, device, dtype, bound) in cases {
+        let device = device.autodiff();
+        for (c, n, degree) in [(1, 7, 0), (1, 700, 1), (2, 65, 2), (1, 700, 3), (3, 33, 3)] {
+            let case = format!("{name}: C = {c}, N = {n}, degree {degree}");
+            let leaves = Leaves::new(c, n, &device, dtype);
+            let fused = leaves.results(leaves.fused(degree));
+            let composed = leaves.results(leaves.composed(degree));
+            // At degree 0 the direction and the rest are no part of it.
+            assert_eq!(fused.len(), if degree == 0 { 2 } else { 5 }, "{case}");
+            for (part, fused) in &fused {
+                let (_, composed) = composed.iter().find(|(name, _)| name == part).unwrap();
+                assert!(composed.iter().any(|x| *x != 0.0), "{case}: {part}");
+                let error = relative(fused, composed);
+                assert!(error <= bound, "{case}: {part} differs by {error:e}");
+            }
+        }
+    }
+}
+
+#[test]
+fn what_does_not_fit_is_an_error() {
+    let device = Device::flex().autodiff();
+    let leaves = Leaves::new(1, 6, &device, DType::F32);
+    let refuse = |rest: Option<Tensor<3>>, centers: Tensor<2>, degree: usize| {
+        sh_colors(
+            leaves.sh0.clone(),
+            rest,
+            leaves.means.clone(),
+            centers,
+            degree,
+        )
+        .unwrap_err()
+    };
+    let rest = |count: usize| Some(leaves.sh_rest.clone().narrow(1, 0, count));
+    for error in [
+        refuse(None, leaves.centers.clone(), 1),
+        refuse(rest(14), leaves.centers.clone(), 3),
+        refuse(rest(15), leaves.centers.clone(), 4),
+        refuse(rest(15), Tensor::zeros([1, 4], &device), 1),
+    ] {
+        assert!(error.to_string().contains("sh_colors"), "{error}");
+    }
+}
