@@ -18,6 +18,7 @@ use crate::project::PACKED;
 use crate::rasterize::MAX_SLOT_VALUES;
 use crate::scan::exclusive_sum_with_total;
 use crate::sort::{bits_for, iota, ordered_bits, sort_pairs};
+use crate::work;
 
 /// Side of a tile in pixels.
 pub const TILE: u32 = 16;
@@ -385,6 +386,7 @@ pub fn intersect(
     let (offsets, instances) =
         exclusive_sum_with_total(client, &counts).map_err(IntersectError::Device)?;
     let instances = check_instances(instances)?;
+    work::listed(instances);
 
     let keys = Buffer::empty(client, instances);
     let slots = Buffer::empty(client, instances);

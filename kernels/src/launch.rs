@@ -5,6 +5,8 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use cubecl::prelude::*;
 use cubecl::server::Handle;
 
+use crate::work;
+
 /// Units of a workgroup in every one-dimensional kernel.
 pub const CUBE_UNITS: u32 = 256;
 /// [`CUBE_UNITS`] as an index.
@@ -50,6 +52,7 @@ impl Buffer {
 
     /// Reserves `len` elements, not initialised.
     pub fn empty(client: &Client, len: usize) -> Self {
+        work::reserved(len.max(1) * 4);
         if POISON.load(Ordering::Relaxed) {
             return Self {
                 handle: client.create_from_slice(u32::as_bytes(&vec![POISONED; len.max(1)])),
@@ -114,6 +117,7 @@ impl Buffer {
     }
 
     fn read(&self, client: &Client) -> Result<cubecl::bytes::Bytes, String> {
+        work::waited();
         client
             .read_one(self.handle.clone())
             .map_err(|error| format!("{error:?}"))
@@ -129,7 +133,10 @@ impl Buffer {
 
 /// `cubes` workgroups, folded into two dimensions when there are more than one dimension can hold. Kernels see one
 /// linear `CUBE_POS`, which may run past `cubes`: they check it.
+///
+/// Every launch asks here once for its workgroups, so this is where launches are counted.
 pub(crate) fn cube_count(cubes: usize) -> CubeCount {
+    work::launched();
     let cubes = u32::try_from(cubes).unwrap_or(u32::MAX);
     if cubes <= MAX_CUBES_PER_DIMENSION {
         return CubeCount::Static(cubes, 1, 1);

@@ -2,10 +2,12 @@
 //!
 //! The kernels know buffers of f32 and sizes; here tensors become buffers and buffers tensors.
 
+mod adam;
 mod blur;
 mod project;
 mod rasterize;
 mod spherical_harmonics;
+mod ssim;
 #[cfg(all(test, feature = "cpu", feature = "wgpu"))]
 pub(crate) mod tests;
 
@@ -16,8 +18,10 @@ use burn_cubecl::kernel::{cast, into_contiguous};
 use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::Buffer;
 
+use crate::adam::AdamStep;
 use crate::backend::SplatBackend;
 use crate::settings::{ProjectArgs, RasterizeArgs};
+use crate::ssim::SsimArgs;
 
 /// A tensor of f32, contiguous.
 fn prepare(tensor: CubeTensor) -> CubeTensor {
@@ -134,5 +138,22 @@ impl SplatBackend for CubeBackend {
 
     fn gaussian_blur(image: CubeTensor, window: &[f64]) -> CubeTensor {
         blur::blur(image, window)
+    }
+    fn ssim_forward(images: [CubeTensor; 2], args: &SsimArgs) -> (CubeTensor, Vec<CubeTensor>) {
+        ssim::forward(images, args)
+    }
+
+    fn ssim_backward(
+        images: [CubeTensor; 2],
+        moments: Vec<CubeTensor>,
+        grad: CubeTensor,
+        args: &SsimArgs,
+        wanted: [bool; 2],
+    ) -> [Option<CubeTensor>; 2] {
+        ssim::backward(images, moments, grad, args, wanted)
+    }
+
+    fn adam(tensors: [CubeTensor; 4], step: &AdamStep) -> [CubeTensor; 3] {
+        adam::step(tensors, step)
     }
 }
