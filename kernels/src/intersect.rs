@@ -133,7 +133,8 @@ fn check_instances(instances: u64) -> Result<usize, IntersectError> {
 /// The part of a splat that can be seen: the ellipse sigma <= `cut`.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
-struct Footprint {
+pub(crate) struct Footprint {
+    /// Whether there is one, of finite size.
     seen: bool,
     mean_x: f32,
     mean_y: f32,
@@ -148,37 +149,92 @@ struct Footprint {
 }
 
 #[cube]
+impl Footprint {
+    pub fn new(
+        mean_x: f32,
+        mean_y: f32,
+        w11: f32,
+        w21: f32,
+        w22: f32,
+        opacity: f32,
+        alpha_min: f32,
+    ) -> Footprint {
+        let ratio = opacity / alpha_min;
+        let cut = f32::ln(ratio) * 1.0001f32 + 1e-4f32;
+        // Standard deviations along x and y: L = W⁻¹ has l11 = 1/w11, l21 = -w21/(w11 w22), l22 = 1/w22.
+        let reach = f32::sqrt(2.0f32 * cut);
+        let half_x = reach / w11;
+        let slope = w21 / w11;
+        let half_y = reach * f32::sqrt(1.0f32 + slope * slope) / w22;
+        let finite = is_finite(ratio)
+            && is_finite(mean_x)
+            && is_finite(mean_y)
+            && is_finite(half_x)
+            && is_finite(half_y);
+        Footprint {
+            seen: finite && opacity >= alpha_min,
+            mean_x,
+            mean_y,
+            w11,
+            w21,
+            w22,
+            cut,
+            half_x,
+            half_y,
+        }
+    }
+
+    /// Whether the ellipse meets the rectangle of the centres of pixels `x..end_x`, `y..end_y`.
+    pub fn touches(self, x: u32, end_x: u32, y: u32, end_y: u32) -> bool {
+        let dx0 = x as f32 + 0.5f32 - self.mean_x;
+        let dy0 = y as f32 + 0.5f32 - self.mean_y;
+        let dx1 = end_x as f32 - 0.5f32 - self.mean_x;
+        let dy1 = end_y as f32 - 0.5f32 - self.mean_y;
+        let beside = dx0 > 0.0f32 || dx1 < 0.0f32;
+        let above = dy0 > 0.0f32 || dy1 < 0.0f32;
+        // Lowest point of the facing vertical edge: dσ/ddy = 0 at dy = -w21 dx / w22.
+        let edge_x = select(dx0 > 0.0f32, dx0, dx1);
+        let on_x = min(max(-self.w21 * edge_x / self.w22, dy0), dy1);
+        // Lowest point of the facing horizontal edge: dσ/ddx = 0 at dx = -w21 w22 dy / (w11² + w21²).
+        let edge_y = select(dy0 > 0.0f32, dy0, dy1);
+        let on_y = min(
+            max(
+                -self.w21 * self.w22 * edge_y / (self.w11 * self.w11 + self.w21 * self.w21),
+                dx0,
+            ),
+            dx1,
+        );
+        let hit_x = beside && self.sigma_below(edge_x, on_x) <= self.cut;
+        let hit_y = above && self.sigma_below(on_y, edge_y) <= self.cut;
+        (!beside && !above) || hit_x || hit_y
+    }
+
+    /// A lower bound of sigma at (dx, dy) from the mean, below its rounding error for long and thin splats.
+    fn sigma_below(self, dx: f32, dy: f32) -> f32 {
+        let z1 = self.w11 * dx;
+        let along = self.w21 * dx;
+        let across = self.w22 * dy;
+        let rounding = 1e-6f32 * (f32::abs(along) + f32::abs(across));
+        let z2 = max(f32::abs(along + across) - rounding, 0.0f32);
+        0.5f32 * (z1 * z1 + z2 * z2)
+    }
+}
+
+/// The footprint of a splat, as it is in memory.
+#[cube]
 fn footprint(packed: &[f32], opacities: &[f32], splat: usize, alpha_min: f32) -> Footprint {
     let at = splat * PACKED;
-    let mean_x = packed[at];
-    let mean_y = packed[at + 1];
-    let w11 = packed[at + 3];
-    let w21 = packed[at + 4];
-    let w22 = packed[at + 5];
-    let opacity = opacities[splat];
-    let ratio = opacity / alpha_min;
-    let cut = f32::ln(ratio) * 1.0001f32 + 1e-4f32;
-    // Standard deviations along x and y: L = W⁻¹ has l11 = 1/w11, l21 = -w21/(w11 w22), l22 = 1/w22.
-    let reach = f32::sqrt(2.0f32 * cut);
-    let half_x = reach / w11;
-    let slope = w21 / w11;
-    let half_y = reach * f32::sqrt(1.0f32 + slope * slope) / w22;
-    let finite = is_finite(ratio)
-        && is_finite(mean_x)
-        && is_finite(mean_y)
-        && is_finite(half_x)
-        && is_finite(half_y);
-    Footprint {
-        seen: finite && packed[at + 7] > 0.0f32 && opacity >= alpha_min,
-        mean_x,
-        mean_y,
-        w11,
-        w21,
-        w22,
-        cut,
-        half_x,
-        half_y,
-    }
+    let mut f = Footprint::new(
+        packed[at],
+        packed[at + 1],
+        packed[at + 3],
+        packed[at + 4],
+        packed[at + 5],
+        opacities[splat],
+        alpha_min,
+    );
+    f.seen = f.seen && packed[at + 7] > 0.0f32;
+    f
 }
 
 /// First tile and end of those that the interval mean +- half reaches, of `count` in a row or column; half a pixel
@@ -194,39 +250,6 @@ fn tile_range(mean: f32, half: f32, count: u32) -> (u32, u32) {
         min(max(low, 0.0f32), limit) as u32,
         min(max(high, 0.0f32), limit) as u32,
     )
-}
-
-/// A lower bound of sigma at (dx, dy) from the mean, below its rounding error for long and thin splats.
-#[cube]
-fn sigma_below(f: Footprint, dx: f32, dy: f32) -> f32 {
-    let z1 = f.w11 * dx;
-    let along = f.w21 * dx;
-    let across = f.w22 * dy;
-    let rounding = 1e-6f32 * (f32::abs(along) + f32::abs(across));
-    let z2 = max(f32::abs(along + across) - rounding, 0.0f32);
-    0.5f32 * (z1 * z1 + z2 * z2)
-}
-
-/// Whether the ellipse meets the rectangle [dx0, dx1] x [dy0, dy1], relative to the mean.
-#[cube]
-fn touches(f: Footprint, dx0: f32, dx1: f32, dy0: f32, dy1: f32) -> bool {
-    let beside = dx0 > 0.0f32 || dx1 < 0.0f32;
-    let above = dy0 > 0.0f32 || dy1 < 0.0f32;
-    // Lowest point of the facing vertical edge: dσ/ddy = 0 at dy = -w21 dx / w22.
-    let edge_x = select(dx0 > 0.0f32, dx0, dx1);
-    let on_x = min(max(-f.w21 * edge_x / f.w22, dy0), dy1);
-    // Lowest point of the facing horizontal edge: dσ/ddx = 0 at dx = -w21 w22 dy / (w11² + w21²).
-    let edge_y = select(dy0 > 0.0f32, dy0, dy1);
-    let on_y = min(
-        max(
-            -f.w21 * f.w22 * edge_y / (f.w11 * f.w11 + f.w21 * f.w21),
-            dx0,
-        ),
-        dx1,
-    );
-    let hit_x = beside && sigma_below(f, edge_x, on_x) <= f.cut;
-    let hit_y = above && sigma_below(f, on_y, edge_y) <= f.cut;
-    (!beside && !above) || hit_x || hit_y
 }
 
 /// Tiles touched by the j-th splat of `order`. Counting: `offsets[j]` = their number. Emitting: their keys (tile index
@@ -259,11 +282,9 @@ fn walk_tiles(
             let (y_low, y_high) = tile_range(f.mean_y, f.half_y, grid.rows);
             for y in y_low..y_high {
                 for x in x_low..x_high {
-                    let dx0 = (x * TILE) as f32 + 0.5f32 - f.mean_x;
-                    let dy0 = (y * TILE) as f32 + 0.5f32 - f.mean_y;
-                    let dx1 = min(x * TILE + TILE, grid.width) as f32 - 0.5f32 - f.mean_x;
-                    let dy1 = min(y * TILE + TILE, grid.height) as f32 - 0.5f32 - f.mean_y;
-                    if touches(f, dx0, dx1, dy0, dy1) {
+                    let end_x = min(x * TILE + TILE, grid.width);
+                    let end_y = min(y * TILE + TILE, grid.height);
+                    if f.touches(x * TILE, end_x, y * TILE, end_y) {
                         if comptime!(emit) {
                             if slot < end {
                                 keys[slot as usize] = first_tile + y * grid.columns + x;

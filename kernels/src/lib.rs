@@ -17,6 +17,7 @@ pub mod exp;
 pub mod intersect;
 mod launch;
 mod math;
+mod planes;
 pub mod project;
 pub mod rasterize;
 pub mod scan;
@@ -28,4 +29,7 @@ mod work;
 #[doc(hidden)]
 pub use launch::poison;
 pub use launch::{Buffer, CUBE_UNITS};
+#[doc(hidden)]
+pub use planes::force_plane_size;
+pub use planes::plane_size;
 pub use work::{Work, work};
