@@ -1,27 +1,35 @@
 //! Which splats touch which tiles, front to back (3DGS section 6).
 //!
-//! Splats are sorted by depth once (equal depths by index); each emits the tiles it touches in that order; a stable
-//! sort by tile then leaves the list of every tile in depth order. An *instance* is one (splat, tile) pair, its *slot*
-//! its place in the order of emission: the slots of one splat are consecutive, so that gradients that were written to
-//! slots can be summed splat by splat, in order.
+//! Visible splats are packed together in the order of their index and sorted by depth (equal depths by index); each
+//! emits the tiles it touches in that order; a stable sort by tile then leaves the list of every tile in depth order. An
+//! *instance* is one (splat, tile) pair, its *slot* its place in the order of emission: the slots of one splat are
+//! consecutive, so that gradients that were written to slots can be summed splat by splat, in order.
 //!
 //! A splat touches a tile iff the ellipse `opacity exp(-sigma) >= alpha_min` meets the rectangle of the tile's pixel
-//! centres: sigma is convex, so unless its centre lies in the rectangle its minimum lies on an edge that faces it.
+//! centres: sigma is convex, so unless its centre lies in the rectangle its minimum lies on an edge that faces it. One
+//! unit tries the tiles of one splat; those of a splat over more than [`WIDE`] tiles are shared out to its workgroup.
+//!
+//! Floor: 28 bytes per splat read and 8 written per visible one; then per visible splat 32 bytes twice (counting and
+//! emitting) and some 40 operations per tile of its bounding box; 12 bytes written per instance, and read again after the
+//! sort.
 
 use std::fmt;
 
 use cubecl::prelude::*;
 
-use crate::launch::{Buffer, per_element};
+use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, per_element};
 use crate::math::is_finite;
 use crate::project::PACKED;
 use crate::rasterize::MAX_SLOT_VALUES;
-use crate::scan::exclusive_sum_with_total;
-use crate::sort::{bits_for, iota, ordered_bits, sort_pairs};
+use crate::scan::{cube_exclusive_sum, exclusive_sum, exclusive_sum_with_total};
+use crate::sort::{bits_for, ordered_bits, sort_first_pairs, sort_pairs};
 use crate::work;
 
 /// Side of a tile in pixels.
 pub const TILE: u32 = 16;
+
+/// Most tiles in the bounding box of a splat whose tiles are tried by one unit.
+const WIDE: u32 = 64;
 
 /// The images that are rendered together.
 #[derive(Clone, Copy, Debug)]
@@ -89,9 +97,11 @@ pub struct TileLists {
     pub slots: Buffer,
     /// First instance and end of every tile [tiles, 2].
     pub ranges: Buffer,
-    /// All splats, front to back.
+    /// How many splats of a lower index are visible; at the end how many there are, V [splats + 1].
+    pub visible: Buffer,
+    /// The visible splats, front to back: the first V of [splats].
     pub order: Buffer,
-    /// `offsets[j]..offsets[j + 1]`: the slots of splat `order[j]` [splats + 1].
+    /// `offsets[j]..offsets[j + 1]`: the slots of splat `order[j]`, for j < V of [splats + 1].
     pub offsets: Buffer,
 }
 
@@ -252,12 +262,124 @@ fn tile_range(mean: f32, half: f32, count: u32) -> (u32, u32) {
     )
 }
 
-/// Tiles touched by the j-th splat of `order`. Counting: `offsets[j]` = their number. Emitting: their keys (tile index
-/// over all cameras), slots and splats, from slot `offsets[j]` on.
+/// The tiles that a splat may touch: a rectangle.
+#[derive(CubeType, Clone, Copy)]
+#[expand(derive(Clone, Copy))]
+struct Reach {
+    x: u32,
+    y: u32,
+    columns: u32,
+    /// Tiles of the box; none if the splat is not seen.
+    tiles: u32,
+}
+
+#[cube]
+impl Reach {
+    fn new(f: Footprint, grid: Grid) -> Reach {
+        let (x, end_x) = tile_range(f.mean_x, f.half_x, grid.columns);
+        let (y, end_y) = tile_range(f.mean_y, f.half_y, grid.rows);
+        let columns = select(end_x > x, end_x - x, 0u32);
+        let rows = select(end_y > y, end_y - y, 0u32);
+        Reach {
+            x,
+            y,
+            columns,
+            tiles: select(f.seen, columns * rows, 0u32),
+        }
+    }
+
+    /// The i-th tile of the box in its image, and whether the splat touches it.
+    fn tile(self, f: Footprint, i: u32, grid: Grid) -> (u32, bool) {
+        let columns = max(self.columns, 1u32);
+        let column = self.x + i % columns;
+        let row = self.y + i / columns;
+        let (x, y) = (column * TILE, row * TILE);
+        let end_x = min(x + TILE, grid.width);
+        let end_y = min(y + TILE, grid.height);
+        (
+            row * grid.columns + column,
+            i < self.tiles && f.touches(x, end_x, y, end_y),
+        )
+    }
+}
+
+/// 1 for every visible splat: one whose bounding box meets its image.
+#[cube(launch)]
+fn find_visible(packed: &[f32], opacities: &[f32], visible: &mut [u32], grid: Grid) {
+    let splat = ABSOLUTE_POS;
+    if splat <= grid.splats as usize {
+        let mut found = 0u32;
+        if splat < grid.splats as usize {
+            let f = footprint(packed, opacities, splat, grid.alpha_min);
+            found = select(Reach::new(f, grid).tiles > 0u32, 1u32, 0u32);
+        }
+        visible[splat] = found;
+    }
+}
+
+/// Depth keys and indices of the visible splats, in the order of their index.
+#[cube(launch)]
+fn pack_visible(
+    packed: &[f32],
+    visible: &[u32],
+    keys: &mut [u32],
+    indices: &mut [u32],
+    splats: u32,
+) {
+    let splat = ABSOLUTE_POS;
+    if splat < splats as usize {
+        let to = visible[splat];
+        if visible[splat + 1] > to {
+            keys[to as usize] = ordered_bits(packed[splat * PACKED + 2]);
+            indices[to as usize] = splat as u32;
+        }
+    }
+}
+
+/// An instance in its slot, unless the slot is another splat's.
+#[cube]
+fn emit_instance(
+    keys: &mut [u32],
+    slots: &mut [u32],
+    slot_splats: &mut [u32],
+    slot: u32,
+    end: u32,
+    tile: u32,
+    splat: u32,
+) {
+    if slot < end {
+        keys[slot as usize] = tile;
+        slots[slot as usize] = slot;
+        slot_splats[slot as usize] = splat;
+    }
+}
+
+/// Counting and emitting are two compilations of one function. Should a compiler round them differently, the slots left
+/// over go to no tile.
+#[cube]
+fn emit_nothing(
+    keys: &mut [u32],
+    slots: &mut [u32],
+    slot_splats: &mut [u32],
+    slot: u32,
+    end: u32,
+    splat: u32,
+    grid: Grid,
+) {
+    let mut slot = slot;
+    while slot < end {
+        emit_instance(keys, slots, slot_splats, slot, end, grid.tiles, splat);
+        slot += 1u32;
+    }
+}
+
+/// Tiles touched by the j-th splat of `order`. Counting: `offsets[j]` = their number, 0 behind the last splat. Emitting:
+/// their keys (tile index over all cameras), slots and splats, from slot `offsets[j]` on.
 #[cube(launch)]
 fn walk_tiles(
     packed: &[f32],
     opacities: &[f32],
+    visible: &[u32],
     order: &[u32],
     offsets: &mut [u32],
     keys: &mut [u32],
@@ -266,61 +388,100 @@ fn walk_tiles(
     grid: Grid,
     #[comptime] emit: bool,
 ) {
-    let j = ABSOLUTE_POS;
-    if j < grid.splats as usize {
+    // The wide splats of the workgroup and the tiles of their boxes.
+    let mut wide = Shared::new_slice(CUBE_UNITS_USIZE);
+    let mut wide_tiles = Shared::new_slice(CUBE_UNITS_USIZE);
+    let mut wide_count = Shared::new_slice(1usize);
+    let mut shared = Shared::new_slice(CUBE_UNITS_USIZE);
+    let j = ABSOLUTE_POS as u32;
+    let mut tiles = 0u32;
+    if j < visible[grid.splats as usize] {
+        let splat = order[j as usize];
+        let f = footprint(packed, opacities, splat as usize, grid.alpha_min);
+        let reach = Reach::new(f, grid);
+        tiles = reach.tiles;
+        if tiles <= WIDE {
+            let first_tile = splat / grid.gaussians * grid.columns * grid.rows;
+            let mut slot = 0u32;
+            let mut end = 0u32;
+            if comptime!(emit) {
+                slot = offsets[j as usize];
+                end = offsets[j as usize + 1];
+            }
+            for i in 0..tiles {
+                let (tile, touched) = reach.tile(f, i, grid);
+                if touched {
+                    if comptime!(emit) {
+                        let tile = first_tile + tile;
+                        emit_instance(keys, slots, slot_splats, slot, end, tile, splat);
+                    }
+                    slot += 1u32;
+                }
+            }
+            if comptime!(emit) {
+                emit_nothing(keys, slots, slot_splats, slot, end, splat, grid);
+            } else {
+                offsets[j as usize] = slot;
+            }
+        }
+    } else if j <= grid.splats {
+        if comptime!(!emit) {
+            offsets[j as usize] = 0u32;
+        }
+    }
+
+    let is_wide = tiles > WIDE;
+    let one = select(is_wide, 1u32, 0u32);
+    let (place, count) = cube_exclusive_sum(one, &mut shared, CUBE_UNITS_USIZE);
+    if is_wide {
+        wide[place as usize] = j;
+        wide_tiles[place as usize] = tiles;
+    }
+    if UNIT_POS == 0 {
+        wide_count[0] = count;
+    }
+    // One after the other, each by all units.
+    let count = workgroup_uniform_load(&wide_count[0]);
+    for entry in 0..count {
+        let j = workgroup_uniform_load(&wide[entry as usize]) as usize;
+        let tiles = workgroup_uniform_load(&wide_tiles[entry as usize]);
         let splat = order[j];
         let f = footprint(packed, opacities, splat as usize, grid.alpha_min);
+        let reach = Reach::new(f, grid);
+        let first_tile = splat / grid.gaussians * grid.columns * grid.rows;
+        let mut touched_here = 0u32;
         let mut slot = 0u32;
         let mut end = 0u32;
         if comptime!(emit) {
             slot = offsets[j];
             end = offsets[j + 1];
         }
-        if f.seen {
-            let first_tile = splat / grid.gaussians * grid.columns * grid.rows;
-            let (x_low, x_high) = tile_range(f.mean_x, f.half_x, grid.columns);
-            let (y_low, y_high) = tile_range(f.mean_y, f.half_y, grid.rows);
-            for y in y_low..y_high {
-                for x in x_low..x_high {
-                    let end_x = min(x * TILE + TILE, grid.width);
-                    let end_y = min(y * TILE + TILE, grid.height);
-                    if f.touches(x * TILE, end_x, y * TILE, end_y) {
-                        if comptime!(emit) {
-                            if slot < end {
-                                keys[slot as usize] = first_tile + y * grid.columns + x;
-                                slots[slot as usize] = slot;
-                                slot_splats[slot as usize] = splat;
-                            }
-                        }
-                        slot += 1u32;
-                    }
+        let mut first = 0u32;
+        while first < tiles {
+            let (tile, touched) = reach.tile(f, first + UNIT_POS, grid);
+            let one = select(touched, 1u32, 0u32);
+            if comptime!(emit) {
+                let (before, total) = cube_exclusive_sum(one, &mut shared, CUBE_UNITS_USIZE);
+                if touched {
+                    let (slot, tile) = (slot + before, first_tile + tile);
+                    emit_instance(keys, slots, slot_splats, slot, end, tile, splat);
                 }
+                slot += total;
+            } else {
+                touched_here += one;
             }
+            first += CUBE_UNITS;
         }
         if comptime!(emit) {
-            // Counting and emitting are two compilations of one function. Should a compiler round them differently,
-            // the slots left over go to no tile.
-            while slot < end {
-                keys[slot as usize] = grid.tiles;
-                slots[slot as usize] = slot;
-                slot_splats[slot as usize] = splat;
-                slot += 1u32;
+            if UNIT_POS == 0 {
+                emit_nothing(keys, slots, slot_splats, slot, end, splat, grid);
             }
         } else {
-            offsets[j] = slot;
+            let (_before, total) = cube_exclusive_sum(touched_here, &mut shared, CUBE_UNITS_USIZE);
+            if UNIT_POS == 0 {
+                offsets[j] = total;
+            }
         }
-    } else if j == grid.splats as usize {
-        if comptime!(!emit) {
-            offsets[j] = 0u32;
-        }
-    }
-}
-
-/// Sort keys of all splats: their depths.
-#[cube(launch)]
-fn depth_keys(packed: &[f32], keys: &mut [u32], splats: u32) {
-    if ABSOLUTE_POS < splats as usize {
-        keys[ABSOLUTE_POS] = ordered_bits(packed[ABSOLUTE_POS * PACKED + 2]);
     }
 }
 
@@ -370,18 +531,34 @@ pub fn intersect(
     frames: &Frames,
 ) -> Result<TileLists, IntersectError> {
     let (splats, tiles) = (frames.splats(), frames.tiles());
-    let depths = Buffer::empty(client, splats);
-    if let Some((count, dim)) = per_element(splats) {
-        depth_keys::launch(
+    let visible = Buffer::empty(client, splats + 1);
+    if let Some((count, dim)) = per_element(splats + 1) {
+        find_visible::launch(
             client,
             count,
             dim,
             packed.arg(),
+            opacities.arg(),
+            visible.arg(),
+            frames.uniforms(),
+        );
+    }
+    let visible = exclusive_sum(client, &visible);
+    let depths = Buffer::empty(client, splats);
+    let indices = Buffer::empty(client, splats);
+    if let Some((count, dim)) = per_element(splats) {
+        pack_visible::launch(
+            client,
+            count,
+            dim,
+            packed.arg(),
+            visible.arg(),
             depths.arg(),
+            indices.arg(),
             splats as u32,
         );
     }
-    let (_, order) = sort_pairs(client, &depths, &iota(client, splats), 32);
+    let (_, order) = sort_first_pairs(client, &depths, &indices, (&visible, splats as u32), 32);
 
     let walk = |offsets: &Buffer, keys: &Buffer, slots: &Buffer, slot_splats: &Buffer, emit| {
         if let Some((count, dim)) = per_element(splats + 1) {
@@ -391,6 +568,7 @@ pub fn intersect(
                 dim,
                 packed.arg(),
                 opacities.arg(),
+                visible.arg(),
                 order.arg(),
                 offsets.arg(),
                 keys.arg(),
@@ -446,6 +624,7 @@ pub fn intersect(
         splats: tile_splats,
         slots,
         ranges,
+        visible,
         order,
         offsets,
     })

@@ -291,6 +291,7 @@ pub fn rasterize_vjp(
                     count,
                     dim,
                     slot_gradients.arg(),
+                    lists.visible.arg(),
                     lists.order.arg(),
                     lists.offsets.arg(),
                     grad_packed.arg(),

@@ -309,10 +309,12 @@ fn put(
     }
 }
 
-/// Sums the slots of every splat in order, and spreads them over the gradients. One unit per (splat, value).
+/// Sums the slots of every visible splat in order, and spreads them over the gradients; those of the others are zero. One
+/// unit per (splat, value).
 #[cube(launch)]
 pub(super) fn sum_slots(
     slot_gradients: &[f32],
+    visible: &[u32],
     order: &[u32],
     offsets: &[u32],
     grad_packed: &mut [f32],
@@ -328,34 +330,78 @@ pub(super) fn sum_slots(
     let j = ABSOLUTE_POS / values;
     let value = ABSOLUTE_POS % values;
     if j < splats as usize {
-        let splat = order[j] as usize;
-        let mut sum = 0.0f32;
-        for slot in offsets[j]..offsets[j + 1] {
-            sum += slot_gradients[slot as usize * values + value];
+        if j < visible[splats as usize] as usize {
+            let mut sum = 0.0f32;
+            for slot in offsets[j]..offsets[j + 1] {
+                sum += slot_gradients[slot as usize * values + value];
+            }
+            spread(
+                grad_packed,
+                grad_colors,
+                grad_opacities,
+                order[j] as usize,
+                value,
+                sum,
+                channels as usize,
+                first_channel as usize,
+                layout,
+                first_launch,
+            );
         }
-        if value >= comptime!(layout.first_color()) {
-            let channel = first_channel as usize + value - comptime!(layout.first_color());
-            if comptime!(layout.colors) {
-                grad_colors[splat * channels as usize + channel] = sum;
-            }
-        } else if comptime!(layout.shape) {
-            // Shape: mean x, y are entries 0, 1 of a packed splat; w11, w21, w22 are 3, 4, 5.
-            let at = splat * PACKED + select(value < 2, value, value + 1);
-            if comptime!(first_launch) {
-                if value == 5 {
-                    grad_opacities[splat] = sum;
-                } else {
-                    grad_packed[at] = sum;
-                }
-                if value < 4 {
-                    // The entries without gradient: depth, compensation, extents.
-                    grad_packed[splat * PACKED + select(value == 0, 2usize, value + 5)] = 0.0f32;
-                }
-            } else if value == 5 {
-                grad_opacities[splat] += sum;
+        // The same unit, as that of a splat by its index.
+        if visible[j] == visible[j + 1] {
+            spread(
+                grad_packed,
+                grad_colors,
+                grad_opacities,
+                j,
+                value,
+                0.0f32,
+                channels as usize,
+                first_channel as usize,
+                layout,
+                first_launch,
+            );
+        }
+    }
+}
+
+/// Puts one summed value of `splat` where it belongs.
+#[cube]
+fn spread(
+    grad_packed: &mut [f32],
+    grad_colors: &mut [f32],
+    grad_opacities: &mut [f32],
+    splat: usize,
+    value: usize,
+    sum: f32,
+    channels: usize,
+    first_channel: usize,
+    #[comptime] layout: SlotLayout,
+    #[comptime] first_launch: bool,
+) {
+    if value >= comptime!(layout.first_color()) {
+        let channel = first_channel + value - comptime!(layout.first_color());
+        if comptime!(layout.colors) {
+            grad_colors[splat * channels + channel] = sum;
+        }
+    } else if comptime!(layout.shape) {
+        // Shape: mean x, y are entries 0, 1 of a packed splat; w11, w21, w22 are 3, 4, 5.
+        let at = splat * PACKED + select(value < 2, value, value + 1);
+        if comptime!(first_launch) {
+            if value == 5 {
+                grad_opacities[splat] = sum;
             } else {
-                grad_packed[at] += sum;
+                grad_packed[at] = sum;
             }
+            if value < 4 {
+                // The entries without gradient: depth, compensation, extents.
+                grad_packed[splat * PACKED + select(value == 0, 2usize, value + 5)] = 0.0f32;
+            }
+        } else if value == 5 {
+            grad_opacities[splat] += sum;
+        } else {
+            grad_packed[at] += sum;
         }
     }
 }
