@@ -21,8 +21,8 @@ use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, per_element};
 use crate::math::is_finite;
 use crate::project::PACKED;
 use crate::rasterize::MAX_SLOT_VALUES;
-use crate::scan::{cube_exclusive_sum, exclusive_sum, exclusive_sum_with_total};
-use crate::sort::{bits_for, ordered_bits, sort_first_pairs, sort_pairs};
+use crate::scan::{PendingTotal, cube_exclusive_sum, exclusive_sum, exclusive_sum_with_total};
+use crate::sort::{bits_for, ordered_bits, sort_first_pairs};
 use crate::work;
 
 /// Side of a tile in pixels.
@@ -91,7 +91,7 @@ pub(crate) struct Grid {
 pub struct TileLists {
     /// Number of instances.
     pub instances: usize,
-    /// Splat (camera N + Gaussian) of every instance, by tile, front to back.
+    /// Splat (camera N + Gaussian) of every instance, by tile, front to back; there may be room for more.
     pub splats: Buffer,
     /// Slot of every instance, in the same order.
     pub slots: Buffer,
@@ -374,7 +374,7 @@ fn emit_nothing(
 }
 
 /// Tiles touched by the j-th splat of `order`. Counting: `offsets[j]` = their number, 0 behind the last splat. Emitting:
-/// their keys (tile index over all cameras), slots and splats, from slot `offsets[j]` on.
+/// their keys (tile index over all cameras), slots and splats, from slot `offsets[j]` on; none from slot `capacity` on.
 #[cube(launch)]
 fn walk_tiles(
     packed: &[f32],
@@ -386,6 +386,7 @@ fn walk_tiles(
     slots: &mut [u32],
     slot_splats: &mut [u32],
     grid: Grid,
+    capacity: u32,
     #[comptime] emit: bool,
 ) {
     // The wide splats of the workgroup and the tiles of their boxes.
@@ -406,7 +407,7 @@ fn walk_tiles(
             let mut end = 0u32;
             if comptime!(emit) {
                 slot = offsets[j as usize];
-                end = offsets[j as usize + 1];
+                end = min(offsets[j as usize + 1], capacity);
             }
             for i in 0..tiles {
                 let (tile, touched) = reach.tile(f, i, grid);
@@ -454,7 +455,7 @@ fn walk_tiles(
         let mut end = 0u32;
         if comptime!(emit) {
             slot = offsets[j];
-            end = offsets[j + 1];
+            end = min(offsets[j + 1], capacity);
         }
         let mut first = 0u32;
         while first < tiles {
@@ -501,20 +502,41 @@ fn lower_bound(keys: &[u32], len: u32, key: u32) -> u32 {
     low
 }
 
+/// Instances, of which the device knows `counted[at]` and there is room for `capacity`.
+#[cube]
+fn instances_listed(counted: &[u32], at: u32, capacity: u32) -> u32 {
+    min(counted[at as usize], capacity)
+}
+
 /// Range of instances of every tile, empty ones too.
 #[cube(launch)]
-fn tile_ranges(keys: &[u32], ranges: &mut [u32], instances: u32, tiles: u32) {
+fn tile_ranges(
+    keys: &[u32],
+    counted: &[u32],
+    ranges: &mut [u32],
+    at: u32,
+    capacity: u32,
+    tiles: u32,
+) {
     let tile = ABSOLUTE_POS;
     if tile < tiles as usize {
+        let instances = instances_listed(counted, at, capacity);
         ranges[tile * 2] = lower_bound(keys, instances, tile as u32);
         ranges[tile * 2 + 1] = lower_bound(keys, instances, tile as u32 + 1u32);
     }
 }
 
-/// `out[i] = table[indices[i]]`
+/// `out[i] = table[indices[i]]` for every instance.
 #[cube(launch)]
-fn gather(indices: &[u32], table: &[u32], out: &mut [u32], len: u32) {
-    if ABSOLUTE_POS < len as usize {
+fn gather(
+    indices: &[u32],
+    table: &[u32],
+    counted: &[u32],
+    out: &mut [u32],
+    at: u32,
+    capacity: u32,
+) {
+    if ABSOLUTE_POS < instances_listed(counted, at, capacity) as usize {
         out[ABSOLUTE_POS] = table[indices[ABSOLUTE_POS] as usize];
     }
 }
@@ -530,104 +552,205 @@ pub fn intersect(
     opacities: &Buffer,
     frames: &Frames,
 ) -> Result<TileLists, IntersectError> {
-    let (splats, tiles) = (frames.splats(), frames.tiles());
-    let visible = Buffer::empty(client, splats + 1);
-    if let Some((count, dim)) = per_element(splats + 1) {
-        find_visible::launch(
-            client,
-            count,
-            dim,
-            packed.arg(),
-            opacities.arg(),
-            visible.arg(),
-            frames.uniforms(),
-        );
-    }
-    let visible = exclusive_sum(client, &visible);
-    let depths = Buffer::empty(client, splats);
-    let indices = Buffer::empty(client, splats);
-    if let Some((count, dim)) = per_element(splats) {
-        pack_visible::launch(
-            client,
-            count,
-            dim,
-            packed.arg(),
-            visible.arg(),
-            depths.arg(),
-            indices.arg(),
-            splats as u32,
-        );
-    }
-    let (_, order) = sort_first_pairs(client, &depths, &indices, (&visible, splats as u32), 32);
+    let (counted, total) = Counted::new(client, packed, opacities, frames);
+    let instances = wait_for_instances(total)?;
+    Ok(counted.list(client, instances))
+}
 
-    let walk = |offsets: &Buffer, keys: &Buffer, slots: &Buffer, slot_splats: &Buffer, emit| {
+/// Lists the splats of every tile as [`intersect`] does, and hands the lists to `then`, without a pause of the device:
+/// room is made for somewhat more instances than there were lately, and the number is looked at when all is under way.
+/// Only if there were more is everything done once more.
+pub(crate) fn intersect_ahead<R>(
+    client: &Client,
+    packed: &Buffer,
+    opacities: &Buffer,
+    frames: &Frames,
+    then: impl Fn(&TileLists) -> R,
+) -> Result<(TileLists, R), IntersectError> {
+    let (counted, total) = Counted::new(client, packed, opacities, frames);
+    let ahead = room::expected().map(|capacity| {
+        let lists = counted.list(client, capacity);
+        let result = then(&lists);
+        (lists, result)
+    });
+    let instances = wait_for_instances(total)?;
+    room::found(instances);
+    Ok(match ahead {
+        Some((mut lists, result)) if instances <= lists.instances => {
+            lists.instances = instances;
+            (lists, result)
+        }
+        _ => {
+            let lists = counted.list(client, instances);
+            let result = then(&lists);
+            (lists, result)
+        }
+    })
+}
+
+fn wait_for_instances(total: PendingTotal<'_>) -> Result<usize, IntersectError> {
+    let instances = check_instances(total.wait().map_err(IntersectError::Device)?)?;
+    work::listed(instances);
+    Ok(instances)
+}
+
+/// How many instances the next call may have. Lists of any capacity that suffices are the same, so that what happened
+/// before never changes a result.
+mod room {
+    use std::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+
+    use super::MAX_INSTANCES;
+
+    /// Largest number lately; less by and by.
+    static LATELY: AtomicUsize = AtomicUsize::new(0);
+
+    /// `None` before the first call.
+    pub fn expected() -> Option<usize> {
+        let lately = LATELY.load(Relaxed);
+        (lately > 0).then(|| (lately + lately / 4).min(MAX_INSTANCES as usize))
+    }
+
+    pub fn found(instances: usize) {
+        let lately = LATELY.load(Relaxed);
+        LATELY.store(instances.max(lately - lately / 16), Relaxed);
+    }
+}
+
+/// The visible splats in order, and where their slots begin: all that is known before there is memory for instances.
+struct Counted<'a> {
+    packed: &'a Buffer,
+    opacities: &'a Buffer,
+    frames: &'a Frames,
+    visible: Buffer,
+    order: Buffer,
+    offsets: Buffer,
+}
+
+impl<'a> Counted<'a> {
+    fn new(
+        client: &'a Client,
+        packed: &'a Buffer,
+        opacities: &'a Buffer,
+        frames: &'a Frames,
+    ) -> (Self, PendingTotal<'a>) {
+        let splats = frames.splats();
+        let flags = Buffer::empty(client, splats + 1);
         if let Some((count, dim)) = per_element(splats + 1) {
-            walk_tiles::launch(
+            find_visible::launch(
                 client,
                 count,
                 dim,
                 packed.arg(),
                 opacities.arg(),
+                flags.arg(),
+                frames.uniforms(),
+            );
+        }
+        let visible = exclusive_sum(client, &flags);
+        let depths = Buffer::empty(client, splats);
+        let indices = Buffer::empty(client, splats);
+        if let Some((count, dim)) = per_element(splats) {
+            pack_visible::launch(
+                client,
+                count,
+                dim,
+                packed.arg(),
                 visible.arg(),
-                order.arg(),
-                offsets.arg(),
+                depths.arg(),
+                indices.arg(),
+                splats as u32,
+            );
+        }
+        let count = (&visible, splats as u32);
+        let (_, order) = sort_first_pairs(client, &depths, &indices, count, 32);
+        let mut counted = Self {
+            packed,
+            opacities,
+            frames,
+            visible,
+            order,
+            offsets: Buffer::empty(client, splats + 1),
+        };
+        let none = [(); 3].map(|()| Buffer::empty(client, 1));
+        counted.walk(client, none.each_ref(), 0, false);
+        let (offsets, total) = exclusive_sum_with_total(client, &counted.offsets);
+        counted.offsets = offsets;
+        (counted, total)
+    }
+
+    /// Counts the tiles of every splat, or emits keys, slots and splats of the instances.
+    fn walk(&self, client: &Client, out: [&Buffer; 3], capacity: usize, emit: bool) {
+        let [keys, slots, slot_splats] = out;
+        if let Some((count, dim)) = per_element(self.frames.splats() + 1) {
+            walk_tiles::launch(
+                client,
+                count,
+                dim,
+                self.packed.arg(),
+                self.opacities.arg(),
+                self.visible.arg(),
+                self.order.arg(),
+                self.offsets.arg(),
                 keys.arg(),
                 slots.arg(),
                 slot_splats.arg(),
-                frames.uniforms(),
+                self.frames.uniforms(),
+                capacity as u32,
                 emit,
             );
         }
-    };
-    let none = || Buffer::empty(client, 1);
-    let counts = Buffer::empty(client, splats + 1);
-    walk(&counts, &none(), &none(), &none(), false);
-    let (offsets, instances) =
-        exclusive_sum_with_total(client, &counts).map_err(IntersectError::Device)?;
-    let instances = check_instances(instances)?;
-    work::listed(instances);
+    }
 
-    let keys = Buffer::empty(client, instances);
-    let slots = Buffer::empty(client, instances);
-    let slot_splats = Buffer::empty(client, instances);
-    if instances > 0 {
-        walk(&offsets, &keys, &slots, &slot_splats, true);
-    }
-    let (keys, slots) = sort_pairs(client, &keys, &slots, bits_for(tiles + 1));
+    /// The lists, if there are at most `capacity` instances; `instances` is that capacity.
+    fn list(&self, client: &Client, capacity: usize) -> TileLists {
+        let tiles = self.frames.tiles();
+        let at = self.frames.splats() as u32;
+        let out = [(); 3].map(|()| Buffer::empty(client, capacity));
+        if capacity > 0 {
+            self.walk(client, out.each_ref(), capacity, true);
+        }
+        let [keys, slots, slot_splats] = out;
+        let count = (&self.offsets, at);
+        let (keys, slots) = sort_first_pairs(client, &keys, &slots, count, bits_for(tiles + 1));
 
-    let ranges = Buffer::empty(client, tiles * 2);
-    if let Some((count, dim)) = per_element(tiles) {
-        tile_ranges::launch(
-            client,
-            count,
-            dim,
-            keys.arg(),
-            ranges.arg(),
-            instances as u32,
-            tiles as u32,
-        );
+        let ranges = Buffer::empty(client, tiles * 2);
+        if let Some((count, dim)) = per_element(tiles) {
+            tile_ranges::launch(
+                client,
+                count,
+                dim,
+                keys.arg(),
+                self.offsets.arg(),
+                ranges.arg(),
+                at,
+                capacity as u32,
+                tiles as u32,
+            );
+        }
+        let tile_splats = Buffer::empty(client, capacity);
+        if let Some((count, dim)) = per_element(capacity) {
+            gather::launch(
+                client,
+                count,
+                dim,
+                slots.arg(),
+                slot_splats.arg(),
+                self.offsets.arg(),
+                tile_splats.arg(),
+                at,
+                capacity as u32,
+            );
+        }
+        TileLists {
+            instances: capacity,
+            splats: tile_splats,
+            slots,
+            ranges,
+            visible: self.visible.clone(),
+            order: self.order.clone(),
+            offsets: self.offsets.clone(),
+        }
     }
-    let tile_splats = Buffer::empty(client, instances);
-    if let Some((count, dim)) = per_element(instances) {
-        gather::launch(
-            client,
-            count,
-            dim,
-            slots.arg(),
-            slot_splats.arg(),
-            tile_splats.arg(),
-            instances as u32,
-        );
-    }
-    Ok(TileLists {
-        instances,
-        splats: tile_splats,
-        slots,
-        ranges,
-        visible,
-        order,
-        offsets,
-    })
 }
 
 #[cfg(test)]

@@ -1,9 +1,12 @@
 //! What every stage shares on the host side: buffers with their length, and how work is folded into workgroups.
 
+use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use cubecl::bytes::Bytes;
+use cubecl::future::reader::try_read_sync;
 use cubecl::prelude::*;
-use cubecl::server::Handle;
+use cubecl::server::{Handle, ServerError};
 
 use crate::work;
 
@@ -117,10 +120,13 @@ impl Buffer {
     }
 
     fn read(&self, client: &Client) -> Result<cubecl::bytes::Bytes, String> {
-        work::waited();
-        client
-            .read_one(self.handle.clone())
-            .map_err(|error| format!("{error:?}"))
+        self.start_reading(client).wait()
+    }
+
+    /// Begins to copy the elements to the host. Work that is launched from now on neither delays the copy nor waits for
+    /// it.
+    pub(crate) fn start_reading<'a>(&self, client: &'a Client) -> PendingRead<'a> {
+        PendingRead(Box::pin(client.read_async(vec![self.handle.clone()])))
     }
 
     /// The buffer as a kernel argument.
@@ -128,6 +134,24 @@ impl Buffer {
         // SAFETY: both constructors make sure that the handle holds `len` elements of four bytes, and every kernel of
         // this crate views buffers as `f32` or `u32`.
         unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len.max(1)) }
+    }
+}
+
+/// Elements on their way to the host.
+pub(crate) struct PendingRead<'a>(
+    Pin<Box<dyn Future<Output = Result<Vec<Bytes>, ServerError>> + Send + 'a>>,
+);
+
+impl PendingRead<'_> {
+    /// Waits until they are there.
+    pub fn wait(self) -> Result<Bytes, String> {
+        work::waited();
+        // Where a thread cannot wait (in a browser) there is nothing unless it has come already.
+        let read = try_read_sync(self.0).ok_or("this platform cannot wait for the device")?;
+        let read = read.map_err(|error| format!("{error:?}"))?;
+        read.into_iter()
+            .next()
+            .ok_or_else(|| "nothing was read".into())
     }
 }
 

@@ -29,7 +29,7 @@ use self::backward::{SHAPE_GRADIENTS, SlotLayout, rasterize_backward, sum_slots}
 use self::forward::rasterize_forward;
 use self::pair::thresholds;
 use self::tile::Plan;
-use crate::intersect::{Frames, IntersectError, TileLists, intersect};
+use crate::intersect::{Frames, IntersectError, TileLists, intersect_ahead};
 use crate::launch::{Buffer, cube_count, per_element};
 use crate::math::is_finite;
 use crate::project::PACKED;
@@ -114,10 +114,11 @@ fn without_broken_colors(client: &Client, inputs: &RasterizeInputs, frames: &Fra
 }
 
 /// Renders all cameras: the image with alpha as its last channel [C, H, W, D + 1], and what the backward pass needs.
-/// Waits for the device once, to learn the number of instances.
+/// Waits once until the
+/// number of instances is known, while the device goes on.
 ///
 /// # Errors
-/// Those of [`intersect`].
+/// Those of [`crate::intersect::intersect`].
 pub fn rasterize(
     client: &Client,
     inputs: &RasterizeInputs,
@@ -125,19 +126,28 @@ pub fn rasterize(
     settings: &RasterizeSettings,
 ) -> Result<(Buffer, RasterizeState), IntersectError> {
     let opacities = without_broken_colors(client, inputs, frames);
-    let lists = intersect(client, &inputs.packed, &opacities, frames)?;
-    Ok(blend(client, inputs, lists, frames, settings, false))
+    let (lists, blended) = intersect_ahead(client, &inputs.packed, &opacities, frames, |lists| {
+        blend(client, inputs, lists, frames, settings, false)
+    })?;
+    let [output, transmittance, walked] = blended;
+    let state = RasterizeState {
+        lists,
+        transmittance,
+        walked,
+    };
+    Ok((output, state))
 }
 
-/// Renders with lists that are there already. `counting`: see [`rasterize_forward`].
+/// Renders with lists that are there already: the image, and of every pixel the transmittance that is left and how many
+/// splats it has walked. `counting`: see [`rasterize_forward`].
 fn blend(
     client: &Client,
     inputs: &RasterizeInputs,
-    lists: TileLists,
+    lists: &TileLists,
     frames: &Frames,
     settings: &RasterizeSettings,
     counting: bool,
-) -> (Buffer, RasterizeState) {
+) -> [Buffer; 3] {
     let plan = Plan::new(client);
     let pixels = frames.cameras * frames.width as usize * frames.height as usize;
     let output = Buffer::empty(client, pixels * (inputs.channels + 1));
@@ -170,12 +180,7 @@ fn blend(
             counting,
         );
     }
-    let state = RasterizeState {
-        lists,
-        transmittance,
-        walked,
-    };
-    (output, state)
+    [output, transmittance, walked]
 }
 
 /// (Pixel, splat) pairs of a forward pass.
@@ -198,9 +203,9 @@ pub fn count_evaluations(
     frames: &Frames,
     settings: &RasterizeSettings,
 ) -> Result<Evaluations, String> {
-    let (_, counts) = blend(client, inputs, state.lists.clone(), frames, settings, true);
-    let tested = counts.transmittance.read_f32(client)?;
-    let blended = counts.walked.read_u32(client)?;
+    let [_, tested, blended] = blend(client, inputs, &state.lists, frames, settings, true);
+    let tested = tested.read_f32(client)?;
+    let blended = blended.read_u32(client)?;
     Ok(Evaluations {
         tested: tested.into_iter().map(|count| count as u64).sum(),
         blended: blended.into_iter().map(u64::from).sum(),

@@ -54,13 +54,15 @@ fn digit_of(key: u32, shift: u32, mask: u32) -> u32 {
     (key >> shift) & mask
 }
 
-/// `counts[digit * blocks + block]` = keys of `block` with that digit. `len[at]`: how many pairs there are.
+/// `counts[digit * blocks + block]` = keys of `block` with that digit. `len[at]`: how many pairs there are,
+/// if not more than `most`.
 #[cube(launch)]
 fn count_digits(
     keys: &[u32],
     len: &[u32],
     counts: &mut [u32],
     at: u32,
+    most: u32,
     blocks: u32,
     shift: u32,
     mask: u32,
@@ -68,7 +70,7 @@ fn count_digits(
 ) {
     let histogram = Shared::<[Atomic<u32>]>::new_slice(digits);
     let unit = UNIT_POS as usize;
-    let len = len[at as usize] as usize;
+    let len = min(len[at as usize], most) as usize;
     if unit < digits {
         Atomic::store(&histogram[unit], 0u32);
     }
@@ -156,7 +158,7 @@ fn rank_by_planes(
 }
 
 /// Moves every pair to `starts[digit, block]` + its rank among the block's pairs with that digit. `len[at]`: how many
-/// pairs there are.
+/// pairs there are, if not more than `most`.
 #[cube(launch)]
 fn scatter(
     keys: &[u32],
@@ -166,6 +168,7 @@ fn scatter(
     keys_out: &mut [u32],
     values_out: &mut [u32],
     at: u32,
+    most: u32,
     blocks: u32,
     shift: u32,
     mask: u32,
@@ -181,7 +184,7 @@ fn scatter(
     let mut lower = Shared::new_slice(digits);
     let unit = UNIT_POS as usize;
     let part = unit / lanes;
-    let len = len[at as usize] as usize;
+    let len = min(len[at as usize], most) as usize;
 
     let mut ranks = Array::<u32>::new(ITEMS);
     if comptime!(lanes == 1) {
@@ -307,6 +310,7 @@ pub(crate) fn sort_first_pairs(
             count.0.arg(),
             counts.arg(),
             count.1,
+            most as u32,
             blocks as u32,
             shift,
             mask,
@@ -326,6 +330,7 @@ pub(crate) fn sort_first_pairs(
             keys_out.arg(),
             values_out.arg(),
             count.1,
+            most as u32,
             blocks as u32,
             shift,
             mask,
