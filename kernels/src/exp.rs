@@ -3,7 +3,7 @@
 //! `2^-t = 2^n 2^-g` with `|g| <= 1/2`, g exact, and a polynomial of degree 5 for `2^-g`, the same coefficients in the
 //! same order as on the native path of `splat-ops`. Every product and sum is a spelled-out fused multiply-add on both:
 //! where the device fuses, both give the same bits; where it does not, they differ in the last place. No compiler is
-//! left the choice, so that the forward and the backward kernel round alike.
+//! left the choice, so that the forward and the backward kernel round alike. Floor: 15 operations.
 
 use cubecl::prelude::*;
 

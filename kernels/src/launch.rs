@@ -1,9 +1,14 @@
 //! What every stage shares on the host side: buffers with their length, and how work is folded into workgroups.
 
+use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+use cubecl::bytes::Bytes;
+use cubecl::future::reader::try_read_sync;
 use cubecl::prelude::*;
-use cubecl::server::Handle;
+use cubecl::server::{Handle, ServerError};
+
+use crate::work;
 
 /// Units of a workgroup in every one-dimensional kernel.
 pub const CUBE_UNITS: u32 = 256;
@@ -50,6 +55,7 @@ impl Buffer {
 
     /// Reserves `len` elements, not initialised.
     pub fn empty(client: &Client, len: usize) -> Self {
+        work::reserved(len.max(1) * 4);
         if POISON.load(Ordering::Relaxed) {
             return Self {
                 handle: client.create_from_slice(u32::as_bytes(&vec![POISONED; len.max(1)])),
@@ -114,9 +120,13 @@ impl Buffer {
     }
 
     fn read(&self, client: &Client) -> Result<cubecl::bytes::Bytes, String> {
-        client
-            .read_one(self.handle.clone())
-            .map_err(|error| format!("{error:?}"))
+        self.start_reading(client).wait()
+    }
+
+    /// Begins to copy the elements to the host. Work that is launched from now on neither delays the copy nor waits for
+    /// it.
+    pub(crate) fn start_reading<'a>(&self, client: &'a Client) -> PendingRead<'a> {
+        PendingRead(Box::pin(client.read_async(vec![self.handle.clone()])))
     }
 
     /// The buffer as a kernel argument.
@@ -127,9 +137,30 @@ impl Buffer {
     }
 }
 
+/// Elements on their way to the host.
+pub(crate) struct PendingRead<'a>(
+    Pin<Box<dyn Future<Output = Result<Vec<Bytes>, ServerError>> + Send + 'a>>,
+);
+
+impl PendingRead<'_> {
+    /// Waits until they are there.
+    pub fn wait(self) -> Result<Bytes, String> {
+        work::waited();
+        // Where a thread cannot wait (in a browser) there is nothing unless it has come already.
+        let read = try_read_sync(self.0).ok_or("this platform cannot wait for the device")?;
+        let read = read.map_err(|error| format!("{error:?}"))?;
+        read.into_iter()
+            .next()
+            .ok_or_else(|| "nothing was read".into())
+    }
+}
+
 /// `cubes` workgroups, folded into two dimensions when there are more than one dimension can hold. Kernels see one
 /// linear `CUBE_POS`, which may run past `cubes`: they check it.
+///
+/// Every launch asks here once for its workgroups, so this is where launches are counted.
 pub(crate) fn cube_count(cubes: usize) -> CubeCount {
+    work::launched();
     let cubes = u32::try_from(cubes).unwrap_or(u32::MAX);
     if cubes <= MAX_CUBES_PER_DIMENSION {
         return CubeCount::Static(cubes, 1, 1);

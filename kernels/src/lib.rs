@@ -3,24 +3,33 @@
 //! One file per stage, the forward pass beside its vector-Jacobian product, in the order of the data's way:
 //! [`project`] and [`sh`] (spherical harmonics) turn Gaussians into screen splats and their colours; [`intersect`]
 //! lists which tiles every splat touches, with [`scan`] and [`sort`]; [`rasterize`] blends each tile front to back;
-//! [`blur`] is the window of SSIM, [`exp`] our own exponential. Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous,
+//! [`ssim`] and [`adam`] are what else a training step does on every pixel and every parameter; [`blur`] is a window by
+//! itself, [`exp`] our own exponential. [`work`] counts what was launched. Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous,
 //! row-major) and launch kernels without waiting, except where they say so. Sums never use float atomics: the same
 //! input gives the same bits on one device.
 
 // `if comptime!(...)` decides while a kernel is built; joined to a condition on the device it would decide there.
 #![allow(clippy::collapsible_if)]
 
+pub mod adam;
 pub mod blur;
 pub mod exp;
 pub mod intersect;
 mod launch;
 mod math;
+mod planes;
 pub mod project;
 pub mod rasterize;
 pub mod scan;
 pub mod sh;
 pub mod sort;
+pub mod ssim;
+mod work;
 
 #[doc(hidden)]
 pub use launch::poison;
 pub use launch::{Buffer, CUBE_UNITS};
+#[doc(hidden)]
+pub use planes::force_plane_size;
+pub use planes::plane_size;
+pub use work::{Work, work};

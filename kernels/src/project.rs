@@ -11,6 +11,9 @@
 //! The determinant is a sum of terms that are never negative (Cauchy-Binet), so needles keep their precision. V and e
 //! are taken in units of the splat's own size (k pixels), so that nothing over- or underflows, be the splat a millionth
 //! of a pixel or a million pictures wide.
+//! Floor per Gaussian and camera: 40 bytes read, 36 written, about 150 operations; gradients: 76 bytes read, 40 written,
+//! and once more 76 read for those of cameras.
+//!
 //! One unit projects one Gaussian to one camera. Gradients of Gaussians are summed over cameras inside one unit;
 //! gradients of cameras by blocks of Gaussians and then over the blocks, always in the same order: no atomics.
 

@@ -1,107 +1,248 @@
 //! Stable least-significant-digit radix sort of (`u32` key, `u32` value) pairs, any length.
 //!
-//! Four bits a pass, three steps each: count the digits of every block, scan the counts digit by digit over all
-//! blocks, move every pair to its place. Ranks inside a block come from counters of every unit in shared memory,
-//! scanned in the order (digit, unit): no plane operations, so any plane size sorts alike.
+//! A few bits a pass, three steps each: count the digits of every block, scan the counts digit by digit over all blocks,
+//! move every pair to its place. Where the device has planes of one known size, ranks come from ballots and a plane's
+//! lane d counts digit d in a register: as many digits as lanes. Elsewhere ranks come from counters of every unit in
+//! shared memory, scanned in the order (digit, unit). Both give the one order that a stable sort has.
+//!
+//! Floor per pair and pass: 12 bytes read (the key twice), 8 written.
 
 use cubecl::prelude::*;
 
 use crate::launch::{Buffer, cube_count, per_element};
+use crate::planes::plane_size;
 use crate::scan::{cube_exclusive_sum, exclusive_sum};
 
-const DIGIT_BITS: u32 = 4;
-const DIGITS: usize = 1 << DIGIT_BITS;
-/// Units of a workgroup: [`DIGITS`] counters of each fit well into the 16 KiB of shared memory that every device has.
+/// Units of a workgroup: 16 counters of each fit well into the 16 KiB of shared memory that every device has.
 const UNITS: u32 = 128;
 const UNITS_USIZE: usize = UNITS as usize;
-/// Consecutive pairs of one unit.
+/// Pairs of one unit.
 const ITEMS: usize = 16;
 const BLOCK: usize = UNITS_USIZE * ITEMS;
+/// Bits of a digit without planes.
+const SHARED_DIGIT_BITS: usize = 4;
 
-/// Which of the [`DIGITS`] bins the pass at `shift` puts `key` in; `mask` leaves out bits that are not to be sorted by.
-#[cube]
-fn digit_of(key: u32, shift: u32, mask: u32) -> usize {
-    ((key >> shift) & mask) as usize
+/// How ranks are found.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+struct Ranking {
+    /// Lanes of a plane; 1 without plane operations.
+    lanes: usize,
 }
 
-/// `counts[digit * blocks + block]` = keys of `block` with that digit.
+impl Ranking {
+    fn digit_bits(self) -> usize {
+        match self.lanes {
+            1 => SHARED_DIGIT_BITS,
+            lanes => lanes.ilog2() as usize,
+        }
+    }
+
+    /// Different digits: with planes as many as lanes.
+    fn digits(self) -> usize {
+        1 << self.digit_bits()
+    }
+
+    /// Parts of a block whose digits are counted apart: planes or units.
+    fn parts(self) -> usize {
+        UNITS_USIZE / self.lanes
+    }
+}
+
+/// Which of the bins the pass at `shift` puts `key` in; `mask` leaves out bits that are not to be sorted by.
+#[cube]
+fn digit_of(key: u32, shift: u32, mask: u32) -> u32 {
+    (key >> shift) & mask
+}
+
+/// `counts[digit * blocks + block]` = keys of `block` with that digit. `len[at]`: how many pairs there are,
+/// if not more than `most`.
 #[cube(launch)]
-fn count_digits(keys: &[u32], counts: &mut [u32], len: u32, blocks: u32, shift: u32, mask: u32) {
-    let histogram = Shared::<[Atomic<u32>]>::new_slice(DIGITS);
+fn count_digits(
+    keys: &[u32],
+    len: &[u32],
+    counts: &mut [u32],
+    at: u32,
+    most: u32,
+    blocks: u32,
+    shift: u32,
+    mask: u32,
+    #[comptime] digits: usize,
+) {
+    let histogram = Shared::<[Atomic<u32>]>::new_slice(digits);
     let unit = UNIT_POS as usize;
-    if unit < DIGITS {
+    let len = min(len[at as usize], most) as usize;
+    if unit < digits {
         Atomic::store(&histogram[unit], 0u32);
     }
     sync_cube();
     for item in 0..ITEMS {
         let at = CUBE_POS * BLOCK + item * UNITS_USIZE + unit;
-        if at < len as usize {
-            Atomic::fetch_add(&histogram[digit_of(keys[at], shift, mask)], 1u32);
+        if at < len {
+            Atomic::fetch_add(&histogram[digit_of(keys[at], shift, mask) as usize], 1u32);
         }
     }
     sync_cube();
-    if unit < DIGITS && CUBE_POS < blocks as usize {
+    if unit < digits && CUBE_POS < blocks as usize {
         counts[unit * blocks as usize + CUBE_POS] = Atomic::load(&histogram[unit]);
     }
 }
 
-/// Moves every pair to `starts[digit, block]` + its rank among the block's pairs with that digit.
+/// Place in the keys of a unit's item. A unit without a plane takes consecutive pairs; the lanes of a plane take pairs
+/// beside each other.
+#[cube]
+fn place(item: usize, #[comptime] ranking: Ranking) -> usize {
+    let lanes = comptime!(ranking.lanes);
+    let unit = UNIT_POS as usize;
+    CUBE_POS * BLOCK + unit / lanes * (ITEMS * lanes) + item * lanes + unit % lanes
+}
+
+/// The lanes of a plane that have `digit`, given for each of its bits those that have it set.
+#[cube]
+fn lanes_with(digit: u32, ballots: &Array<u32>, valid: u32, #[comptime] bits: usize) -> u32 {
+    let mut lanes = valid;
+    #[unroll]
+    for bit in 0..bits {
+        let set = (digit >> bit as u32) & 1u32 == 1u32;
+        lanes &= select(set, ballots[bit], !ballots[bit]);
+    }
+    lanes
+}
+
+/// Ranks of a unit's pairs among those of the same digit in its plane, and how often the digit that is the unit's lane
+/// occurs in the plane. All units of a plane must call it together.
+#[cube]
+fn rank_by_planes(
+    keys: &[u32],
+    ranks: &mut Array<u32>,
+    len: usize,
+    shift: u32,
+    mask: u32,
+    #[comptime] ranking: Ranking,
+) -> u32 {
+    let bits = comptime!(ranking.digit_bits());
+    let lanes = comptime!(ranking.lanes);
+    let lane = UNIT_POS % lanes as u32;
+    let mut low = Array::<u32>::new(bits);
+    let mut high = Array::<u32>::new(bits);
+    // Lanes before this one.
+    let before_low = select(lane < 32u32, (1u32 << (lane % 32u32)) - 1u32, u32::MAX);
+    let before_high = select(lane < 32u32, 0u32, (1u32 << (lane % 32u32)) - 1u32);
+    let mut counted = 0u32;
+    #[unroll]
+    for item in 0..ITEMS {
+        let at = place(item, ranking);
+        let inside = at < len;
+        let digit = digit_of(keys[select(inside, at, 0)], shift, mask);
+        let valid = plane_ballot(inside);
+        #[unroll]
+        for bit in 0..bits {
+            let ballot = plane_ballot((digit >> bit as u32) & 1u32 == 1u32);
+            low[bit] = ballot.extract(0usize);
+            high[bit] = ballot.extract(1usize);
+        }
+        let same = lanes_with(digit, &low, valid.extract(0usize), bits);
+        let mine = lanes_with(lane, &low, valid.extract(0usize), bits);
+        let mut rank = (same & before_low).count_ones();
+        let mut more = mine.count_ones();
+        if comptime!(lanes > 32) {
+            let same = lanes_with(digit, &high, valid.extract(1usize), bits);
+            let mine = lanes_with(lane, &high, valid.extract(1usize), bits);
+            rank += (same & before_high).count_ones();
+            more += mine.count_ones();
+        }
+        // How often this digit has occurred is known by the lane of that number.
+        ranks[item] = plane_shuffle(counted, digit) + rank;
+        counted += more;
+    }
+    counted
+}
+
+/// Moves every pair to `starts[digit, block]` + its rank among the block's pairs with that digit. `len[at]`: how many
+/// pairs there are, if not more than `most`.
 #[cube(launch)]
 fn scatter(
     keys: &[u32],
     values: &[u32],
+    len: &[u32],
     starts: &[u32],
     keys_out: &mut [u32],
     values_out: &mut [u32],
-    len: u32,
+    at: u32,
+    most: u32,
     blocks: u32,
     shift: u32,
     mask: u32,
+    #[comptime] ranking: Ranking,
 ) {
-    // ranks[digit * UNITS + unit]: first the unit's count of the digit, then the rank of its next such pair.
-    let mut ranks = Shared::new_slice(DIGITS * UNITS_USIZE);
+    let digits = comptime!(ranking.digits());
+    let parts = comptime!(ranking.parts());
+    let lanes = comptime!(ranking.lanes);
+    // Of every digit and part: first how often it occurs there, then how often in the block before that.
+    let mut before = Shared::new_slice(comptime!(digits * parts));
     let mut shared = Shared::new_slice(UNITS_USIZE);
-    let mut digit_ranks = Shared::new_slice(DIGITS);
+    // Occurrences in the block of all lower digits.
+    let mut lower = Shared::new_slice(digits);
     let unit = UNIT_POS as usize;
-    let first = CUBE_POS * BLOCK + unit * ITEMS;
+    let part = unit / lanes;
+    let len = min(len[at as usize], most) as usize;
 
-    for digit in 0..DIGITS {
-        ranks[digit * UNITS_USIZE + unit] = 0u32;
+    let mut ranks = Array::<u32>::new(ITEMS);
+    if comptime!(lanes == 1) {
+        for digit in 0..digits {
+            before[digit * parts + part] = 0u32;
+        }
+        for item in 0..ITEMS {
+            let at = place(item, ranking);
+            if at < len {
+                let digit = digit_of(keys[at], shift, mask) as usize;
+                before[digit * parts + part] += 1u32;
+            }
+        }
+    } else {
+        let counted = rank_by_planes(keys, &mut ranks, len, shift, mask, ranking);
+        before[unit % lanes * parts + part] = counted;
     }
-    for item in 0..ITEMS {
-        if first + item < len as usize {
-            ranks[digit_of(keys[first + item], shift, mask) * UNITS_USIZE + unit] += 1u32;
+    sync_cube();
+
+    // Scan of all counters: every unit takes some consecutive ones.
+    let share = comptime!((digits * parts).div_ceil(UNITS_USIZE));
+    let mut sum = 0u32;
+    for k in 0..share {
+        if unit * share + k < comptime!(digits * parts) {
+            sum += before[unit * share + k];
+        }
+    }
+    let (start, _total) = cube_exclusive_sum(sum, &mut shared, UNITS_USIZE);
+    let mut running = start;
+    for k in 0..share {
+        if unit * share + k < comptime!(digits * parts) {
+            let count = before[unit * share + k];
+            before[unit * share + k] = running;
+            running += count;
         }
     }
     sync_cube();
-
-    // Scan of all DIGITS x UNITS counters: every unit takes DIGITS consecutive ones.
-    let mut sum = 0u32;
-    for k in 0..DIGITS {
-        sum += ranks[unit * DIGITS + k];
-    }
-    let (before, _total) = cube_exclusive_sum(sum, &mut shared, UNITS_USIZE);
-    let mut running = before;
-    for k in 0..DIGITS {
-        let count = ranks[unit * DIGITS + k];
-        ranks[unit * DIGITS + k] = running;
-        running += count;
-    }
-    sync_cube();
-    if unit < DIGITS {
-        digit_ranks[unit] = ranks[unit * UNITS_USIZE];
+    if unit < digits {
+        lower[unit] = before[unit * parts];
     }
     sync_cube();
 
+    #[unroll(comptime!(lanes > 1))]
     for item in 0..ITEMS {
-        if first + item < len as usize {
-            let key = keys[first + item];
-            let digit = digit_of(key, shift, mask);
-            let rank = ranks[digit * UNITS_USIZE + unit];
-            ranks[digit * UNITS_USIZE + unit] = rank + 1u32;
-            let to = starts[digit * blocks as usize + CUBE_POS] + rank - digit_ranks[digit];
+        let from = place(item, ranking);
+        if from < len {
+            let key = keys[from];
+            let digit = digit_of(key, shift, mask) as usize;
+            let counter = digit * parts + part;
+            let mut rank = before[counter] - lower[digit];
+            if comptime!(lanes == 1) {
+                before[counter] += 1u32;
+            } else {
+                rank += ranks[item];
+            }
+            let to = starts[digit * blocks as usize + CUBE_POS] + rank;
             keys_out[to as usize] = key;
-            values_out[to as usize] = values[first + item];
+            values_out[to as usize] = values[from];
         }
     }
 }
@@ -132,47 +273,71 @@ pub fn sort_pairs(
     key_bits: u32,
 ) -> (Buffer, Buffer) {
     let len = keys.len().min(values.len());
+    let count = Buffer::from_u32(client, &[len as u32]);
+    sort_first_pairs(client, keys, values, (&count, 0), key_bits)
+}
+
+/// Sorts the first pairs, as many as element `count.1` of `count.0` says; what is behind them in the results is not
+/// defined. The host need not know how many they are.
+pub(crate) fn sort_first_pairs(
+    client: &Client,
+    keys: &Buffer,
+    values: &Buffer,
+    count: (&Buffer, u32),
+    key_bits: u32,
+) -> (Buffer, Buffer) {
+    let most = keys.len().min(values.len());
     let (mut keys, mut values) = (keys.clone(), values.clone());
-    if len == 0 {
+    if most == 0 {
         return (Buffer::empty(client, 0), Buffer::empty(client, 0));
     }
-    let blocks = len.div_ceil(BLOCK);
+    let ranking = Ranking {
+        lanes: plane_size(client).unwrap_or(1),
+    };
+    let digit_bits = ranking.digit_bits() as u32;
+    let blocks = most.div_ceil(BLOCK);
     let dim = CubeDim::new_1d(UNITS);
     let mut shift = 0;
     let key_bits = key_bits.min(32);
     while shift < key_bits {
-        let mask = (1 << DIGIT_BITS.min(key_bits - shift)) - 1;
-        let counts = Buffer::empty(client, DIGITS * blocks);
+        let mask = (1 << digit_bits.min(key_bits - shift)) - 1;
+        let counts = Buffer::empty(client, ranking.digits() * blocks);
         count_digits::launch(
             client,
             cube_count(blocks),
             dim,
             keys.arg(),
+            count.0.arg(),
             counts.arg(),
-            len as u32,
+            count.1,
+            most as u32,
             blocks as u32,
             shift,
             mask,
+            ranking.digits(),
         );
         let starts = exclusive_sum(client, &counts);
-        let keys_out = Buffer::empty(client, len);
-        let values_out = Buffer::empty(client, len);
+        let keys_out = Buffer::empty(client, most);
+        let values_out = Buffer::empty(client, most);
         scatter::launch(
             client,
             cube_count(blocks),
             dim,
             keys.arg(),
             values.arg(),
+            count.0.arg(),
             starts.arg(),
             keys_out.arg(),
             values_out.arg(),
-            len as u32,
+            count.1,
+            most as u32,
             blocks as u32,
             shift,
             mask,
+            ranking,
         );
         (keys, values) = (keys_out, values_out);
-        shift += DIGIT_BITS;
+        shift += digit_bits;
     }
     (keys, values)
 }

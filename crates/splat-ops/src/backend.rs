@@ -4,7 +4,7 @@
 use core::fmt::Debug;
 
 use burn::backend::{
-    Backend, ExtensionType, TensorMetadata, backend_extension, get_or_init_device_settings,
+    Backend, ExtensionType, backend_extension,
     tensor::{FloatTensor, IntTensor},
 };
 // The expansion of `#[backend_extension]` names these.
@@ -12,7 +12,7 @@ use burn::backend::{
 use burn::backend::{Autodiff, Dispatch};
 
 use crate::activation::Activation;
-use crate::adam::{AdamRows, AdamStep};
+use crate::adam::AdamStep;
 use crate::composed;
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
@@ -189,36 +189,8 @@ pub trait SplatBackend: Backend {
         composed::screen_statistics::<Self>(tensors, half)
     }
 
-    /// Parameter, gradient and both moments to parameter and moments after
-    /// [`adam_step`](crate::adam_step). Composed of tensor ops unless a backend knows better.
-    fn adam(tensors: [FloatTensor<Self>; 4], step: &AdamStep) -> [FloatTensor<Self>; 3] {
-        let before = [0, 2, 3].map(|i| tensors[i].clone());
-        let grad_before = tensors[1].clone();
-        let [param, grad, moment_1, moment_2] = tensors;
-        let decay = |moment, beta: f64, fresh| {
-            Self::float_add(
-                Self::float_mul_scalar(moment, beta.into()),
-                Self::float_mul_scalar(fresh, (1.0 - beta).into()),
-            )
-        };
-        // A gradient whose square is not finite counts as zero. Written so that NaN fails the comparison.
-        let square = Self::float_mul(grad.clone(), grad.clone());
-        let bools = get_or_init_device_settings::<Self>(&square.device()).bool_dtype;
-        let usable = Self::float_lower_equal_elem(square, f32::MAX.into(), bools);
-        let grad = Self::float_mask_fill(grad, Self::bool_not(usable), 0.0.into());
-        let square = Self::float_mul(grad.clone(), grad.clone());
-        let moment_1 = decay(moment_1, step.beta_1, grad);
-        let moment_2 = decay(moment_2, step.beta_2, square);
-        let root = Self::float_sqrt(moment_2.clone());
-        let root = Self::float_add_scalar(root, step.epsilon.into());
-        let delta = Self::float_div(moment_1.clone(), root);
-        let delta = Self::float_mul_scalar(delta, step.rate.into());
-        let after = [Self::float_sub(param, delta), moment_1, moment_2];
-        match step.rows {
-            AdamRows::All => after,
-            AdamRows::Seen => composed::where_seen::<Self>(grad_before, before, after),
-        }
-    }
+    /// Parameter, gradient and both moments to parameter and moments after [`adam_step`](crate::adam_step).
+    fn adam(tensors: [FloatTensor<Self>; 4], step: &AdamStep) -> [FloatTensor<Self>; 3];
 }
 
 /// What [`sh_colors`](crate::sh_colors) takes.

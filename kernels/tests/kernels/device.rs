@@ -5,16 +5,30 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 use splat_kernels::Buffer;
 
-/// A client of the default wgpu adapter, software ones included. `None`, loudly, where there is no adapter.
+/// A client of the default wgpu adapter, software ones included, of which kernels take the way that this test program is
+/// about: with planes or without. `None`, loudly, where there is no adapter.
 pub fn client() -> Option<Client> {
     use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
-    for kind in [DefaultDevice, Cpu] {
-        if let Ok(device) = cubecl::Device::wgpu(kind) {
-            return Some(device.client());
+    let found = [DefaultDevice, Cpu]
+        .into_iter()
+        .find_map(|kind| cubecl::Device::wgpu(kind).ok());
+    let Some(device) = found else {
+        eprintln!("\n*** SKIPPED: no wgpu adapter here, the kernels were NOT tested ***\n");
+        return None;
+    };
+    let client = device.client();
+    splat_kernels::force_plane_size(Some(0));
+    if crate::PLANES {
+        // Software devices are not asked whether they have planes, but may.
+        let hardware = &client.properties().hardware;
+        let size = hardware.plane_size_max;
+        splat_kernels::force_plane_size((hardware.plane_size_min == size).then_some(size));
+        if splat_kernels::plane_size(&client).is_none() {
+            eprintln!("\n*** SKIPPED: no planes of one known size here ***\n");
+            return None;
         }
     }
-    eprintln!("\n*** SKIPPED: no wgpu adapter on this machine, the kernels were NOT tested ***\n");
-    None
+    Some(client)
 }
 
 pub fn rng(seed: u64) -> Pcg32 {

@@ -134,6 +134,64 @@ fn every_tile_with_a_visible_pixel_is_kept_and_hardly_any_other() {
 }
 
 #[test]
+fn splats_over_many_tiles_are_listed_by_all_units_together() {
+    let frames = Frames {
+        cameras: 2,
+        gaussians: 300,
+        width: 500,
+        height: 330,
+        alpha_min: ALPHA_MIN,
+    };
+    // Every tenth is large: most of the picture, a disc over a few hundred tiles, or a needle across it.
+    let mut rng = rng(23);
+    let (mut packed, mut opacities) = (Vec::new(), Vec::new());
+    for i in 0..2 * frames.gaussians {
+        let (a, b) = match i % 30 {
+            0 => (400.0, 300.0),
+            10 => (90.0, 60.0),
+            20 => (1000.0, 0.5),
+            _ => (rng.random_range(0.1..6.0), 1.0),
+        };
+        let (x, y) = (
+            rng.random_range(0.0f32..500.0),
+            rng.random_range(0.0..330.0),
+        );
+        let angle = rng.random_range(0.0..std::f64::consts::PI);
+        packed.extend(row(x, y, 1.0 + i as f32, a, b, angle));
+        opacities.push(rng.random_range(0.01..1.0));
+    }
+    let Some((found, tiles)) = lists(&frames, &packed, &opacities) else {
+        return;
+    };
+    let columns = frames.width.div_ceil(TILE);
+    let rows = frames.height.div_ceil(TILE);
+    let mut unseen = 0;
+    for (tile, list) in tiles.iter().enumerate() {
+        let (camera, tile) = (
+            tile as u32 / (columns * rows),
+            tile as u32 % (columns * rows),
+        );
+        let (x0, y0) = (tile % columns * TILE, tile / columns * TILE);
+        for splat in 0..frames.gaussians as u32 {
+            let splat = (camera * frames.gaussians as u32 + splat) as usize;
+            let row = wide(&packed[splat * 9..splat * 9 + 9]);
+            let opacity = f64::from(opacities[splat]);
+            let seen = (y0..(y0 + TILE).min(frames.height)).any(|y| {
+                (x0..(x0 + TILE).min(frames.width)).any(|x| {
+                    let (x, y) = (f64::from(x) + 0.5, f64::from(y) + 0.5);
+                    raw_alpha(&row, opacity, x, y) >= f64::from(ALPHA_MIN)
+                })
+            });
+            let listed = list.contains(&(splat as u32));
+            assert!(listed || !seen, "camera {camera}: tile {tile} lost {splat}");
+            unseen += usize::from(listed && !seen);
+        }
+    }
+    println!("{} instances, {unseen} without a pixel", found.instances);
+    assert!(found.instances > 10_000 && unseen < found.instances / 50);
+}
+
+#[test]
 fn tiles_are_in_order_of_depth_and_then_of_index() {
     let frames = Frames {
         cameras: 2,
@@ -179,14 +237,25 @@ fn slots_of_a_splat_are_consecutive_and_name_its_instances() {
         return;
     };
     let client = client().unwrap();
-    let [splats, slots, order, offsets] =
-        [&lists.splats, &lists.slots, &lists.order, &lists.offsets]
-            .map(|b| download_u32(&client, b));
+    let [splats, slots, visible, order, offsets] = [
+        &lists.splats,
+        &lists.slots,
+        &lists.visible,
+        &lists.order,
+        &lists.offsets,
+    ]
+    .map(|b| download_u32(&client, b));
     let mut owner = vec![u32::MAX; lists.instances];
-    for j in 0..order.len() {
+    let found = visible[frames.gaussians] as usize;
+    assert!(found > 100 && found < frames.gaussians);
+    for j in 0..found {
         owner[offsets[j] as usize..offsets[j + 1] as usize].fill(order[j]);
     }
-    assert_eq!(offsets[order.len()] as usize, lists.instances);
+    assert_eq!(offsets[found] as usize, lists.instances);
+    for (splat, pair) in visible.windows(2).enumerate() {
+        let listed = order[..found].contains(&(splat as u32));
+        assert_eq!(pair[1] - pair[0], u32::from(listed), "splat {splat}");
+    }
     for (splat, slot) in splats.iter().zip(&slots) {
         assert_eq!(owner[*slot as usize], *splat);
     }

@@ -1,4 +1,5 @@
-//! The kernels against the standard library and plain float64 references, on whatever wgpu adapter is there.
+//! The kernels against the standard library and plain float64 references, on whatever wgpu adapter is there. Those that
+//! can use plane operations do without them here; `planes.rs` beside this has the others.
 
 mod blur;
 mod device;
@@ -10,3 +11,6 @@ mod reference;
 mod scan;
 mod sh;
 mod sort;
+
+/// Whether kernels use plane operations.
+const PLANES: bool = false;

@@ -1,7 +1,9 @@
 //! Blending and its gradients.
 
 use splat_kernels::intersect::Frames;
-use splat_kernels::rasterize::{RasterizeInputs, RasterizeSettings, rasterize, rasterize_vjp};
+use splat_kernels::rasterize::{
+    RasterizeInputs, RasterizeSettings, count_evaluations, rasterize, rasterize_vjp,
+};
 
 use crate::device::{
     assert_close, client, differences, download, download_u32, rng, uniform, upload, wide,
@@ -409,7 +411,53 @@ fn more_tiles_than_one_dimension_of_workgroups_can_hold() {
     );
 }
 
-/// Prints times of the stages; run it by name with `--ignored --nocapture`.
+#[test]
+fn evaluations_are_counted() {
+    let Some(client) = client() else { return };
+    let scene = Scene::new(1, 90, 50, 35, 1, [0.3, 0.98], 44);
+    let inputs = scene.inputs(&client);
+    let (_, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
+    let count = count_evaluations(&client, &inputs, &state, &scene.frames, &SETTINGS).unwrap();
+
+    let [packed, _, opacities, _] = scene.wide();
+    let mut order: Vec<usize> = (0..scene.frames.gaussians).collect();
+    order.sort_by(|&a, &b| packed[a * 9 + 2].total_cmp(&packed[b * 9 + 2]));
+    let (mut blended, mut until_stop) = (0, 0);
+    for pixel in 0..50 * 35 {
+        let (x, y) = ((pixel % 50) as f64 + 0.5, (pixel / 50) as f64 + 0.5);
+        let mut t = 1.0;
+        for &i in &order {
+            until_stop += 1;
+            let raw = reference::raw_alpha(&packed[i * 9..i * 9 + 9], opacities[i], x, y);
+            if raw < 1.0 / 255.0 {
+                continue;
+            }
+            let next = t * (1.0 - raw.min(0.99));
+            if next < 9.999e-5 {
+                break;
+            }
+            t = next;
+            blended += 1;
+        }
+    }
+    println!("{count:?}; {until_stop} without any lists");
+    assert_eq!(count.blended, blended);
+    assert!(count.tested > count.blended && count.tested < until_stop / 2);
+}
+
+/// Seconds of processor time that this process has used: other work on the machine does not count.
+fn processor_seconds() -> f64 {
+    let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
+    // After the name in parentheses: utime and stime are entries 11 and 12, in hundredths of a second.
+    let fields = stat.rsplit(')').next().unwrap_or_default();
+    let ticks = fields.split_whitespace().skip(11).take(2);
+    ticks
+        .filter_map(|ticks| ticks.parse::<f64>().ok())
+        .sum::<f64>()
+        / 100.0
+}
+
+/// Prints processor times of the stages on a software device; run it by name with `--ignored --nocapture`.
 #[test]
 #[ignore = "a measurement, not a check"]
 fn time_of_the_stages_at_270_by_480() {
@@ -418,7 +466,13 @@ fn time_of_the_stages_at_270_by_480() {
     let inputs = scene.inputs(&client);
     let grad = upload(&client, &vec![1.0; 270 * 480 * 4]);
     for round in 0..4 {
-        let start = std::time::Instant::now();
+        let mut at = processor_seconds();
+        let mut lap = |name: &str| {
+            let now = processor_seconds();
+            print!("{name} {:.2} s, ", now - at);
+            at = now;
+        };
+        print!("round {round}: ");
         let lists = splat_kernels::intersect::intersect(
             &client,
             &inputs.packed,
@@ -427,10 +481,10 @@ fn time_of_the_stages_at_270_by_480() {
         )
         .unwrap();
         download_u32(&client, &lists.ranges);
-        let intersected = start.elapsed();
+        lap("intersect");
         let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
         download(&client, &output);
-        let rendered = start.elapsed() - intersected;
+        lap("intersect + forward");
         let grads = rasterize_vjp(
             &client,
             &inputs,
@@ -441,11 +495,7 @@ fn time_of_the_stages_at_270_by_480() {
             [true; 4],
         );
         download(&client, grads[2].as_ref().unwrap());
-        let all = start.elapsed();
-        println!(
-            "round {round}: {} instances, intersect {intersected:?}, intersect + forward {rendered:?}, backward {:?}",
-            lists.instances,
-            all - rendered - intersected,
-        );
+        lap("backward");
+        println!("{} instances", lists.instances);
     }
 }

@@ -135,6 +135,7 @@ pub(crate) fn screen_statistics<B: Backend>(
 }
 
 /// `after` in the rows whose gradient is not all zero, `before` in the others.
+#[cfg(feature = "cube")]
 pub(crate) fn where_seen<B: Backend>(
     grad: FloatTensor<B>,
     before: [FloatTensor<B>; 3],

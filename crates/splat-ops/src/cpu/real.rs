@@ -211,17 +211,27 @@ fn exp2_neg_f32<const FMA: bool>(t: f32) -> f32 {
     )
 }
 
-/// `2^-g` for `|g| <= 1/2`.
+/// Horner's rule, coefficients from the highest degree down.
 #[inline(always)]
-fn polynomial<const FMA: bool>(g: f32) -> f32 {
-    let mut p = EXP2[0];
-    for coefficient in &EXP2[1..] {
-        p = f32::multiply_add::<FMA>(p, g, *coefficient);
+fn polynomial<const FMA: bool>(coefficients: &[f32; 6], x: f32) -> f32 {
+    let mut p = coefficients[0];
+    for coefficient in &coefficients[1..] {
+        p = f32::multiply_add::<FMA>(p, x, *coefficient);
     }
     p
 }
 
-/// `exp(x) = 2^n 2^-g` for any x, with the same polynomial: infinite and zero where that is out of range, NaN for NaN.
+/// As [`EXP2`], of `e^r` on `|r| <= ln(2) / 2`, 9.1e-8.
+const EXP: [f32; 6] = [
+    0.008_290_315,
+    0.041_897_93,
+    0.166_676_36,
+    0.499_991_5,
+    0.999_999_7,
+    1.0,
+];
+
+/// `exp(x) = 2^n e^r` for any x: infinite and zero where that is out of range, NaN for NaN.
 #[inline(always)]
 fn exp_f32<const FMA: bool>(x: f32) -> f32 {
     // ln(2) in two parts; the first has so few bits that n * LN2_HIGH is exact.
@@ -235,7 +245,7 @@ fn exp_f32<const FMA: bool>(x: f32) -> f32 {
     let shifted = multiply_add(x, core::f32::consts::LOG2_E, ROUND);
     let n = shifted - ROUND;
     let r = multiply_add(-n, LN2_LOW, multiply_add(-n, LN2_HIGH, x));
-    let p = polynomial::<FMA>(r * -core::f32::consts::LOG2_E);
+    let p = polynomial::<FMA>(&EXP, r);
     // n may be 128, or -150: neither is the exponent of a normal number, but those of its halves are.
     let n = (shifted.to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32);
     let half = n >> 1;

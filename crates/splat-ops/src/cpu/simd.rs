@@ -1,8 +1,8 @@
 //! Code for the processor at hand: chosen at run time, so that one binary runs everywhere.
 
-/// Defines a function whose body is compiled twice, for the baseline and for AVX2 with FMA, and
-/// which takes the one that the processor can run. What the body calls must be `#[inline(always)]`,
-/// or it stays compiled for the baseline.
+/// Defines a function whose body is compiled for the baseline, for AVX2 with FMA and for AVX-512, and which takes the
+/// best that the processor can run. What the body calls must be `#[inline(always)]`, or it stays compiled for the
+/// baseline.
 ///
 /// `FMA` tells the body whether fused products and sums are instructions (they are calls otherwise).
 /// Rust never fuses by itself: where the body does not ask for it, the numbers are the same either way.
@@ -22,9 +22,17 @@ macro_rules! vectorized {
                 fn avx2<T: Real>($($argument: $type),*) $(-> $result)? {
                     body::<T, true>($($argument),*)
                 }
-                if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-                    // SAFETY: the features that `avx2` is compiled for were just found.
-                    return unsafe { avx2($($argument),*) };
+                // Twice the registers, so that constants stay in them, and masks.
+                #[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512dq,avx512vl")]
+                fn avx512<T: Real>($($argument: $type),*) $(-> $result)? {
+                    body::<T, true>($($argument),*)
+                }
+                match $crate::cpu::InstructionSet::chosen() {
+                    // SAFETY: these are the features that `chosen` asks the processor for.
+                    $crate::cpu::InstructionSet::Avx512 => return unsafe { avx512($($argument),*) },
+                    // SAFETY: as above.
+                    $crate::cpu::InstructionSet::Avx2 => return unsafe { avx2($($argument),*) },
+                    _ => {}
                 }
             }
             // Every 64-bit Arm processor fuses.

@@ -4,10 +4,12 @@
 //!
 //! The `tracing` spans have the names of those on the CPU, and last as long as it takes to launch the kernels: these run on.
 
+mod adam;
 mod blur;
 mod project;
 mod rasterize;
 mod spherical_harmonics;
+mod ssim;
 #[cfg(all(test, feature = "cpu", feature = "wgpu"))]
 pub(crate) mod tests;
 
@@ -19,8 +21,10 @@ use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::Buffer;
 use tracing::trace_span;
 
+use crate::adam::AdamStep;
 use crate::backend::SplatBackend;
 use crate::settings::{ProjectArgs, RasterizeArgs};
+use crate::ssim::SsimArgs;
 
 /// A tensor of f32, contiguous.
 fn prepare(tensor: CubeTensor) -> CubeTensor {
@@ -144,5 +148,22 @@ impl SplatBackend for CubeBackend {
     fn gaussian_blur(image: CubeTensor, window: &[f64]) -> CubeTensor {
         let _span = trace_span!("blur").entered();
         blur::blur(image, window)
+    }
+    fn ssim_forward(images: [CubeTensor; 2], args: &SsimArgs) -> (CubeTensor, Vec<CubeTensor>) {
+        ssim::forward(images, args)
+    }
+
+    fn ssim_backward(
+        images: [CubeTensor; 2],
+        moments: Vec<CubeTensor>,
+        grad: CubeTensor,
+        args: &SsimArgs,
+        wanted: [bool; 2],
+    ) -> [Option<CubeTensor>; 2] {
+        ssim::backward(images, moments, grad, args, wanted)
+    }
+
+    fn adam(tensors: [CubeTensor; 4], step: &AdamStep) -> [CubeTensor; 3] {
+        adam::step(tensors, step)
     }
 }

@@ -5,8 +5,8 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
 use crate::{
-    ImageSize, OpError, ProjectSettings, RasterizeSettings, gaussian_blur, project, rasterize,
-    spherical_harmonics,
+    AdamRows, AdamStep, ImageSize, OpError, ProjectSettings, RasterizeSettings, SsimArgs,
+    adam_step, gaussian_blur, project, rasterize, spherical_harmonics, ssim_map,
 };
 
 /// Whether there is a wgpu adapter, a software one included.
@@ -173,6 +173,107 @@ fn kernels_agree_with_the_native_path_in_images_and_all_gradients() {
         println!("{name}: relative L2 {error:.1e}");
         // Both are f32: within the 1e-4 that each keeps to float64.
         assert!(error <= 1e-4, "{name}: relative L2 {error:e}");
+    }
+}
+
+/// S, and the gradients of both images for random weights.
+fn run_ssim(device: &Device, shape: [usize; 4], args: &SsimArgs) -> Vec<Vec<f32>> {
+    let device = device.clone().autodiff();
+    let mut rng = Pcg32::seed_from_u64(11);
+    let mut image = || {
+        let len = shape.iter().product::<usize>();
+        let values: Vec<f32> = (0..len).map(|_| rng.random_range(0.0..1.0)).collect();
+        Tensor::<4>::from_data(TensorData::new(values, shape), &device)
+    };
+    let [x, y, weights] = [image().require_grad(), image().require_grad(), image()];
+    let map = ssim_map(x.clone(), y.clone(), args).unwrap();
+    let grads = (map.clone() * weights).sum().backward();
+    [map, x.grad(&grads).unwrap(), y.grad(&grads).unwrap()]
+        .map(|tensor| tensor.into_data().try_to_vec::<f32>().unwrap())
+        .into()
+}
+
+#[test]
+fn structural_similarity_and_its_gradients_are_those_of_the_native_path() {
+    if !has_adapter() {
+        return;
+    }
+    // Windows whose loops are unrolled, one whose loops are not, and images smaller than the window.
+    for (shape, taps) in [
+        ([2, 19, 23, 3], 11),
+        ([1, 5, 40, 1], 11),
+        ([1, 1, 1, 2], 3),
+        ([1, 33, 17, 4], 1),
+        ([1, 20, 21, 2], 25),
+    ] {
+        let weights: Vec<f64> = (0..taps)
+            .map(|k| (-(k as f64 - (taps / 2) as f64).powi(2) / 4.5).exp())
+            .collect();
+        let total: f64 = weights.iter().sum();
+        let args = SsimArgs {
+            window: weights.iter().map(|weight| weight / total).collect(),
+            c1: 1e-4,
+            c2: 9e-4,
+        };
+        let native = run_ssim(&Device::flex(), shape, &args);
+        let kernels = run_ssim(&Device::wgpu(DeviceKind::DefaultDevice), shape, &args);
+        for (what, (kernels, native)) in ["map", "x", "y"].iter().zip(kernels.iter().zip(&native)) {
+            let error = relative_l2(kernels, native);
+            println!("{shape:?}, {taps} taps, {what}: relative L2 {error:.1e}");
+            // A window of one value alone measures no contrast: c2 / c2 up to rounding, and no gradient through it.
+            let limit = if taps == 1 { 1e-4 } else { 1e-5 };
+            assert!(error <= limit, "{shape:?}, {taps} taps, {what}: {error:e}");
+        }
+    }
+}
+
+/// Three steps of Adam; a gradient in the second is not a number, one in the third too large to be squared. Some rows
+/// have no gradient.
+fn run_adam(device: &Device, rows: AdamRows) -> Vec<f32> {
+    let mut rng = Pcg32::seed_from_u64(12);
+    let mut values = |low: f32, high: f32| {
+        let values: Vec<f32> = (0..1001).map(|_| rng.random_range(low..high)).collect();
+        values
+    };
+    let mut gradients = [values(-1.0, 1.0), values(-1e-6, 1e-6), values(-1e3, 1e3)];
+    for gradient in &mut gradients {
+        gradient[13 * 20..13 * 30].fill(0.0);
+    }
+    gradients[1][5] = f32::NAN;
+    gradients[2][7] = 1e30;
+    let tensor =
+        |values: Vec<f32>| Tensor::<2>::from_data(TensorData::new(values, [77, 13]), device);
+    let mut param = tensor(values(-1.0, 1.0));
+    let mut moments = [param.zeros_like(), param.zeros_like()];
+    let step = AdamStep {
+        beta_1: 0.9,
+        beta_2: 0.999,
+        rate: 1e-3,
+        epsilon: 1e-15,
+        rows,
+    };
+    for gradient in gradients {
+        (param, moments) = adam_step(param, tensor(gradient), moments, &step).unwrap();
+    }
+    let [moment_1, moment_2] = moments;
+    [param, moment_1, moment_2]
+        .into_iter()
+        .flat_map(|tensor| tensor.into_data().try_to_vec::<f32>().unwrap())
+        .collect()
+}
+
+#[test]
+fn a_step_of_adam_is_that_of_the_native_path() {
+    if !has_adapter() {
+        return;
+    }
+    for rows in [AdamRows::All, AdamRows::Seen] {
+        let native = run_adam(&Device::flex(), rows);
+        let kernel = run_adam(&Device::wgpu(DeviceKind::DefaultDevice), rows);
+        for (i, (kernel, native)) in kernel.iter().zip(&native).enumerate() {
+            let error = (kernel - native).abs() / native.abs().max(1e-30);
+            assert!(error <= 1e-6, "{rows:?}, value {i}: {kernel} and {native}");
+        }
     }
 }
 

@@ -58,6 +58,7 @@ const BASELINE: Limit = Limit {
 /// against AVX2.
 fn limit(instructions: InstructionSet) -> Limit {
     match instructions {
+        InstructionSet::Avx512 => AVX512,
         InstructionSet::Avx2 | InstructionSet::Neon => AVX2,
         InstructionSet::Baseline => BASELINE,
     }

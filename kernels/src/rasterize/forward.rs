@@ -1,0 +1,189 @@
+//! Blending of a tile, front to back.
+//!
+//! Floor per (block, splat) pair: 24 bytes of shape and 4 per channel from shared memory; per pixel of the block about
+//! 30 operations and 2 per channel. Per (tile, splat) pair: 28 bytes and 4 per channel from memory; per pixel 12 bytes
+//! and 4 per channel to memory.
+
+use cubecl::prelude::*;
+
+use super::pair::{SHAPE, Shape, Thresholds, UNSEEN, sample};
+use super::tile::{BATCH, Batch, Plan, WORDS, pixel_index, place};
+use crate::intersect::Grid;
+
+/// One workgroup per tile; `width` channels from `first_channel` on. Counting: instead of what is left of the light and
+/// of the splats walked, every pixel writes how many splats were tested for it and how many it blended.
+#[cube(launch)]
+pub(super) fn rasterize_forward(
+    packed: &[f32],
+    colors: &[f32],
+    opacities: &[f32],
+    background: &[f32],
+    splats: &[u32],
+    ranges: &[u32],
+    output: &mut [f32],
+    transmittance: &mut [f32],
+    walked: &mut [u32],
+    grid: Grid,
+    thresholds: Thresholds,
+    channels: u32,
+    first_channel: u32,
+    #[comptime] plan: Plan,
+    #[comptime] width: usize,
+    #[comptime] has_background: bool,
+    #[comptime] first_launch: bool,
+    #[comptime] counting: bool,
+) {
+    let pixels = comptime!(plan.pixels());
+    let units = comptime!(plan.units());
+    let mut batch = Batch::new(plan, width);
+    let mut range = Shared::new_slice(2usize);
+    let finished = Shared::<[Atomic<u32>]>::new_slice(1usize);
+    // Every block may walk the whole list: it is not known yet how far it gets.
+    let ends = Shared::<[Atomic<u32>]>::new_slice(comptime!(plan.blocks()));
+    let place = place(grid, plan);
+
+    if UNIT_POS == 0 {
+        let mut start = 0u32;
+        let mut end = 0u32;
+        if place.tile < grid.tiles {
+            start = ranges[place.tile as usize * 2];
+            end = ranges[place.tile as usize * 2 + 1];
+        }
+        range[0] = start;
+        range[1] = end;
+        Atomic::store(&finished[0], 0u32);
+    }
+    if place.lane == 0 {
+        Atomic::store(&ends[place.block as usize], u32::MAX);
+    }
+    let start = workgroup_uniform_load(&range[0]);
+    let end = workgroup_uniform_load(&range[1]);
+
+    let mut t = Array::<f32>::new(pixels);
+    let mut last = Array::<u32>::new(pixels);
+    // 1 until the pixel stops, then 0.
+    let mut open = Array::<u32>::new(pixels);
+    let mut sums = Array::<f32>::new(comptime!(pixels * width));
+    let mut tested = Array::<u32>::new(pixels);
+    let mut open_pixels = 0u32;
+    #[unroll]
+    for q in 0..pixels {
+        let (x, y) = place.pixel(q, plan);
+        let (inside, _index) = pixel_index(grid, place, x, y);
+        t[q] = 1.0f32;
+        last[q] = 0u32;
+        tested[q] = 0u32;
+        open[q] = select(inside, 1u32, 0u32);
+        open_pixels += open[q];
+        #[unroll]
+        for channel in 0..width {
+            sums[q * width + channel] = 0.0f32;
+        }
+    }
+    if open_pixels == 0u32 {
+        Atomic::fetch_add(&finished[0], 1u32);
+    }
+    sync_cube();
+
+    let mut first = start;
+    while first < end {
+        // Also keeps the units together: the batch before is no longer read.
+        if workgroup_uniform_load_atomic(&finished[0]) >= comptime!(units as u32) {
+            break;
+        }
+        let count = min(comptime!(BATCH as u32), end - first);
+        batch.clear(plan);
+        sync_cube();
+        let mut k = UNIT_POS;
+        while k < count {
+            let splat = splats[(first + k) as usize] as usize;
+            let color = splat * channels as usize + first_channel as usize;
+            batch.load(
+                packed, colors, opacities, splat, color, k as usize, 0u32, &ends, grid, place,
+                plan, width,
+            );
+            k += comptime!(units as u32);
+        }
+        sync_cube();
+
+        let was_open = open_pixels > 0u32;
+        for word in 0..WORDS {
+            let mut bits = batch.bits(place.block, word);
+            while bits != 0u32 && open_pixels > 0u32 {
+                let k = word * 32 + bits.trailing_zeros() as usize;
+                bits &= bits - 1u32;
+                let at = k * comptime!(SHAPE + width);
+                let shape = Shape::load(&batch.splats, at);
+                let mut color = Array::<f32>::new(width);
+                #[unroll]
+                for channel in 0..width {
+                    color[channel] = batch.splats[at + SHAPE + channel];
+                }
+                #[unroll]
+                for q in 0..pixels {
+                    let (x, y) = place.pixel(q, plan);
+                    let s = sample(shape, x as f32 + 0.5f32, y as f32 + 0.5f32);
+                    let raw = select(open[q] == 1u32, s.raw, UNSEEN);
+                    let seen = thresholds.seen(raw);
+                    let alpha = thresholds.alpha(raw);
+                    let next = t[q] * (1.0f32 - alpha);
+                    // The pixel stops before a splat that would leave too little light.
+                    let left = select(thresholds.stops(next), 0u32, 1u32);
+                    let blended = select(seen, left, 0u32);
+                    if comptime!(counting) {
+                        tested[q] += open[q];
+                    }
+                    open[q] = select(seen, left, open[q]);
+                    let blends = blended == 1u32;
+                    let weight = select(blends, alpha * t[q], 0.0f32);
+                    #[unroll]
+                    for channel in 0..width {
+                        sums[q * width + channel] += weight * color[channel];
+                    }
+                    t[q] = select(blends, next, t[q]);
+                    if comptime!(counting) {
+                        last[q] += blended;
+                    } else {
+                        last[q] = select(blends, first + k as u32 + 1u32 - start, last[q]);
+                    }
+                }
+                open_pixels = 0u32;
+                #[unroll]
+                for q in 0..pixels {
+                    open_pixels += open[q];
+                }
+            }
+        }
+        if was_open && open_pixels == 0u32 {
+            Atomic::fetch_add(&finished[0], 1u32);
+        }
+        first += comptime!(BATCH as u32);
+    }
+
+    #[unroll]
+    for q in 0..pixels {
+        let (x, y) = place.pixel(q, plan);
+        let (inside, pixel) = pixel_index(grid, place, x, y);
+        if inside {
+            let out = pixel * (channels as usize + 1) + first_channel as usize;
+            #[unroll]
+            for channel in 0..width {
+                let mut sum = sums[q * width + channel];
+                if comptime!(has_background) {
+                    let at = (place.camera * channels + first_channel) as usize + channel;
+                    sum += t[q] * background[at];
+                }
+                output[out + channel] = sum;
+            }
+            if comptime!(first_launch) {
+                output[out + channels as usize] = 1.0f32 - t[q];
+                transmittance[pixel] = if comptime!(counting) {
+                    tested[q] as f32
+                } else {
+                    t[q]
+                };
+                walked[pixel] = last[q];
+            }
+        }
+    }
+}

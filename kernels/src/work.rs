@@ -1,0 +1,69 @@
+//! What the kernels of this crate were asked to do: launches, memory, waits. For benchmarks; counting costs one atomic
+//! addition each.
+
+use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
+
+static LAUNCHES: AtomicU64 = AtomicU64::new(0);
+static RESERVED: AtomicU64 = AtomicU64::new(0);
+static WAITS: AtomicU64 = AtomicU64::new(0);
+static INSTANCES: AtomicU64 = AtomicU64::new(0);
+
+/// Totals since the process began, over all threads and devices. What a step did is a difference of two:
+///
+/// ```
+/// let before = splat_kernels::work();
+/// // ... a step ...
+/// let step = splat_kernels::work().since(before);
+/// assert_eq!(step.launches, 0);
+/// ```
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Work {
+    /// Kernels of this crate that were launched (those of Burn and CubeCL itself are not seen here).
+    pub launches: u64,
+    /// Bytes of device memory that were reserved for results and scratch; the device's pool may hand out the same bytes
+    /// many times.
+    pub reserved_bytes: u64,
+    /// How often the host waited for the device.
+    pub waits: u64,
+    /// (Splat, tile) pairs that were listed.
+    pub instances: u64,
+}
+
+impl Work {
+    /// What was done after `earlier`.
+    #[must_use]
+    pub fn since(self, earlier: Self) -> Self {
+        Self {
+            launches: self.launches - earlier.launches,
+            reserved_bytes: self.reserved_bytes - earlier.reserved_bytes,
+            waits: self.waits - earlier.waits,
+            instances: self.instances - earlier.instances,
+        }
+    }
+}
+
+/// The totals so far.
+pub fn work() -> Work {
+    Work {
+        launches: LAUNCHES.load(Relaxed),
+        reserved_bytes: RESERVED.load(Relaxed),
+        waits: WAITS.load(Relaxed),
+        instances: INSTANCES.load(Relaxed),
+    }
+}
+
+pub(crate) fn launched() {
+    LAUNCHES.fetch_add(1, Relaxed);
+}
+
+pub(crate) fn reserved(bytes: usize) {
+    RESERVED.fetch_add(bytes as u64, Relaxed);
+}
+
+pub(crate) fn waited() {
+    WAITS.fetch_add(1, Relaxed);
+}
+
+pub(crate) fn listed(instances: usize) {
+    INSTANCES.fetch_add(instances as u64, Relaxed);
+}
