@@ -7,7 +7,7 @@
 //!
 //! A splat touches a tile iff the ellipse `opacity exp(-sigma) >= alpha_min` meets the rectangle of the tile's pixel
 //! centres: sigma is convex, so unless its centre lies in the rectangle its minimum lies on an edge that faces it. One
-//! unit tries the tiles of one splat; those of a splat over more than [`WIDE`] tiles are shared out to its workgroup.
+//! unit tries the tiles of one splat; those of a splat over more than 64 tiles are shared out to its workgroup.
 //!
 //! Floor: 28 bytes per splat read and 8 written per visible one; then per visible splat 32 bytes twice (counting and
 //! emitting) and some 40 operations per tile of its bounding box; 12 bytes written per instance, and read again after the
@@ -99,7 +99,7 @@ pub struct TileLists {
     pub ranges: Buffer,
     /// How many splats of a lower index are visible; at the end how many there are, V [splats + 1].
     pub visible: Buffer,
-    /// The visible splats, front to back: the first V of [splats].
+    /// The visible splats, front to back: V of them, in memory for all.
     pub order: Buffer,
     /// `offsets[j]..offsets[j + 1]`: the slots of splat `order[j]`, for j < V of [splats + 1].
     pub offsets: Buffer,

@@ -14,7 +14,7 @@
 //! Gradients of one (tile, splat) pair are summed over the tile's pixels in fixed order and written to the pair's own
 //! slot; then the slots of every splat are summed in order. No atomics on floats: the same bits every time.
 //!
-//! Any number of channels: those beyond [`MAX_CHANNELS`] go in further launches, each a chunk of them.
+//! Any number of channels: those beyond what one launch can do (at most [`MAX_CHANNELS`]) go in further ones.
 
 mod background;
 mod backward;
@@ -34,7 +34,7 @@ use crate::launch::{Buffer, cube_count, per_element};
 use crate::math::is_finite;
 use crate::project::PACKED;
 
-/// Channels of one launch: what a unit keeps of them for each of its pixels must fit into its registers.
+/// Most channels of one launch; fewer without planes, where a unit has more pixels.
 pub const MAX_CHANNELS: usize = 16;
 
 /// Most gradients of one instance in one launch.
@@ -155,7 +155,7 @@ fn blend(
     let walked = Buffer::empty(client, pixels);
     let background = inputs.background.clone();
     let background = background.unwrap_or_else(|| Buffer::empty(client, 1));
-    for first_channel in (0..inputs.channels).step_by(MAX_CHANNELS) {
+    for first_channel in (0..inputs.channels).step_by(plan.channels()) {
         rasterize_forward::launch(
             client,
             cube_count(frames.tiles()),
@@ -174,7 +174,7 @@ fn blend(
             inputs.channels as u32,
             first_channel as u32,
             plan,
-            MAX_CHANNELS.min(inputs.channels - first_channel),
+            plan.channels().min(inputs.channels - first_channel),
             inputs.background.is_some(),
             first_channel == 0,
             counting,
@@ -257,11 +257,11 @@ pub fn rasterize_vjp(
     if shape || wants_colors {
         let background = inputs.background.clone();
         let background = background.unwrap_or_else(|| Buffer::empty(client, 1));
-        for first_channel in (0..channels).step_by(MAX_CHANNELS) {
+        for first_channel in (0..channels).step_by(plan.channels()) {
             let layout = SlotLayout {
                 shape,
                 colors: wants_colors,
-                width: MAX_CHANNELS.min(channels - first_channel),
+                width: plan.channels().min(channels - first_channel),
             };
             let slot_gradients = zeros(client, lists.instances * layout.values());
             if lists.instances > 0 {

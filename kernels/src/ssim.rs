@@ -6,7 +6,7 @@
 //! dS/dmx = 2 my (C - A) / (B D) + 2 mx S (1/D - 1/B),   dS/dq = -S / D,   dS/dp = 2 A / (B D)
 //! dL/dx = blur(g dS/dmx) + 2 x blur(g dS/dq) + y blur(g dS/dp)
 //! ```
-//! mx, my, q, p: windowed means of x, y, x² + y², xy. A unit makes [`RUN`] neighbouring values of each, so that what it
+//! mx, my, q, p: windowed means of x, y, x² + y², xy. A unit makes eight neighbouring values of each, so that what it
 //! reads serves several of them: with the window of 11, 18 reads instead of 88.
 //!
 //! Floor per pixel and channel. Forward: 8 bytes read, 4 written, and 16 written to be kept; 2 x 4 x 11 fused

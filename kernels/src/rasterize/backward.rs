@@ -231,37 +231,34 @@ pub(super) fn rasterize_backward(
                     t[q] = before;
                 }
 
-                let to = in_group as usize * comptime!(values * blocks) + place.block as usize;
+                let mut parts = Array::<f32>::new(values);
                 if comptime!(layout.shape) {
                     // d = pixel - mean
-                    let mean_x = -(shape.w11 * sum_z1 + shape.w21 * sum_z2);
-                    let mean_y = -(shape.w22 * sum_z2);
-                    put(&mut partials, to, 0usize, mean_x, place.lane, plan);
-                    put(&mut partials, to, 1usize, mean_y, place.lane, plan);
-                    put(&mut partials, to, 2usize, sum_z1_dx, place.lane, plan);
-                    put(&mut partials, to, 3usize, sum_z2_dx, place.lane, plan);
-                    put(&mut partials, to, 4usize, sum_z2_dy, place.lane, plan);
-                    put(
-                        &mut partials,
-                        to,
-                        5usize,
-                        -sum / shape.opacity,
-                        place.lane,
-                        plan,
-                    );
+                    parts[0] = -(shape.w11 * sum_z1 + shape.w21 * sum_z2);
+                    parts[1] = -(shape.w22 * sum_z2);
+                    parts[2] = sum_z1_dx;
+                    parts[3] = sum_z2_dx;
+                    parts[4] = sum_z2_dy;
+                    parts[5] = -sum / shape.opacity;
                 }
                 if comptime!(layout.colors) {
                     #[unroll]
                     for channel in 0..width {
-                        let value = comptime!(layout.first_color()) + channel;
-                        put(
-                            &mut partials,
-                            to,
-                            value,
-                            color_sums[channel],
-                            place.lane,
-                            plan,
-                        );
+                        parts[comptime!(layout.first_color()) + channel] = color_sums[channel];
+                    }
+                }
+                // All units of a plane are here together: they walk the same block.
+                if comptime!(plan.lanes() > 1) {
+                    #[unroll]
+                    for value in 0..values {
+                        parts[value] = plane_sum(parts[value]);
+                    }
+                }
+                if place.lane == 0 {
+                    let to = in_group as usize * comptime!(values * blocks);
+                    #[unroll]
+                    for value in 0..values {
+                        partials[to + value * blocks + place.block as usize] = parts[value];
                     }
                 }
             }
@@ -285,27 +282,6 @@ pub(super) fn rasterize_backward(
             from += comptime!(group as u32);
         }
         remaining -= count;
-    }
-}
-
-/// `partials[to + value, block]` = the sum of what the block's units have. All units of a plane must call it together.
-#[cube]
-fn put(
-    partials: &mut [f32],
-    to: usize,
-    value: usize,
-    part: f32,
-    lane: u32,
-    #[comptime] plan: Plan,
-) {
-    let at = to + value * comptime!(plan.blocks());
-    if comptime!(plan.lanes() == 1) {
-        partials[at] = part;
-    } else {
-        let sum = plane_sum(part);
-        if lane == 0 {
-            partials[at] = sum;
-        }
     }
 }
 
@@ -402,6 +378,35 @@ fn spread(
             grad_opacities[splat] += sum;
         } else {
             grad_packed[at] += sum;
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::MAX_CHANNELS;
+    use super::super::tile::WORDS;
+    use super::*;
+
+    #[test]
+    fn every_layout_fits_into_the_shared_memory_of_any_device() {
+        for lanes in [1, 8, 16, 32, 64] {
+            let plan = Plan::with_lanes(lanes);
+            for width in 1..=MAX_CHANNELS {
+                for (shape, colors) in [(true, true), (true, false), (false, true)] {
+                    let layout = SlotLayout {
+                        shape,
+                        colors,
+                        width,
+                    };
+                    let group = layout.group(plan);
+                    assert!(32 % group == 0, "a group shares a word of bits");
+                    let batch = BATCH * (SHAPE + width) + 2 * BATCH + plan.blocks() * WORDS;
+                    let partials = group * layout.values() * plan.blocks();
+                    let bytes = 4 * (batch + partials + plan.blocks() + 2);
+                    assert!(bytes <= 16_384, "{bytes} bytes: {lanes} lanes, {layout:?}");
+                }
+            }
         }
     }
 }

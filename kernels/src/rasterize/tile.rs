@@ -7,6 +7,7 @@
 use cubecl::client::Client;
 use cubecl::prelude::*;
 
+use super::MAX_CHANNELS;
 use super::pair::SHAPE;
 use crate::intersect::{Footprint, Grid, TILE};
 use crate::planes::plane_size;
@@ -33,8 +34,18 @@ impl Plan {
         }
     }
 
+    #[cfg(test)]
+    pub fn with_lanes(lanes: usize) -> Self {
+        Self { lanes }
+    }
+
     pub fn lanes(self) -> usize {
         self.lanes
+    }
+
+    /// Most channels of one launch: what a unit keeps of them for all of its pixels must fit into its registers.
+    pub fn channels(self) -> usize {
+        if self.lanes == 1 { 8 } else { MAX_CHANNELS }
     }
 
     /// Pixels along a side of a block.
@@ -231,7 +242,7 @@ mod tests {
     #[test]
     fn every_plan_deals_out_every_pixel_of_a_tile_once() {
         for lanes in [1, 8, 16, 32, 64] {
-            let plan = Plan { lanes };
+            let plan = Plan::with_lanes(lanes);
             assert_eq!(plan.units() * plan.pixels(), (TILE * TILE) as usize);
             assert!(plan.blocks() <= 32, "a block is a bit");
             assert!(plan.units() <= 256, "every device has that many units");

@@ -497,5 +497,12 @@ fn time_of_the_stages_at_270_by_480() {
         download(&client, grads[2].as_ref().unwrap());
         lap("backward");
         println!("{} instances", lists.instances);
+        if round == 3 {
+            let count =
+                count_evaluations(&client, &inputs, &state, &scene.frames, &SETTINGS).unwrap();
+            let walked = download_u32(&client, &state.walked);
+            let walked: u64 = walked.into_iter().map(u64::from).sum();
+            println!("{count:?}; {walked} splats of their tiles' lists were walked by all pixels");
+        }
     }
 }

@@ -205,7 +205,7 @@ fn exp2_neg_f32<const FMA: bool>(t: f32) -> f32 {
     let g = t + (shifted - ROUND);
     // The low bits of `shifted` are n; added to the exponent they multiply by 2^n.
     f32::from_bits(
-        polynomial::<FMA>(g)
+        polynomial::<FMA>(&EXP2, g)
             .to_bits()
             .wrapping_add(shifted.to_bits() << 23),
     )
