@@ -227,6 +227,7 @@ fn benches_of_speed_leave_their_figures() {
 
     let rasterize = figures(&[&["rasterize", text(&capture)], &small[..]].concat());
     assert_eq!(rasterize["work"]["views"], 8);
+    assert!(rasterize["rows"][0]["lists"]["median"].as_f64().unwrap() > 0.0);
     for direction in ["forward", "backward"] {
         let rate = &rasterize["rows"][0][direction]["tested_per_second"];
         assert!(rate.as_f64().unwrap() > 0.0, "{rasterize}");

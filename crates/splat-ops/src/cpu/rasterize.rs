@@ -24,6 +24,7 @@ use std::sync::Arc;
 
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
+use tracing::trace_span;
 
 use super::buffer::{Buffer, overwritten, tensor};
 use super::intersect::{CHUNK, Grid, TILE, TileLists};
@@ -73,6 +74,7 @@ struct Frame<T> {
 
 impl<T: Real> Frame<T> {
     fn new(camera: &Camera<T>, args: &RasterizeArgs) -> Result<Self, OpError> {
+        let _span = trace_span!("rasterize lists").entered();
         let (lists, footprints) =
             TileLists::new(camera.packed, camera.colors, camera.opacities, args)?;
         let splats = footprints.par_iter().with_min_len(CHUNK).map(Splat::new);

@@ -24,7 +24,7 @@ pub struct Work {
     pub pixels: f64,
     /// (pixel, Gaussian) pairs that the inner loop evaluates.
     pub tested: f64,
-    /// Those past the alpha cut.
+    /// Those past the alpha cut; as [`RasterizeWork`](splat_ops::RasterizeWork) has it, beyond the image's edges too.
     pub seen: f64,
     /// Those blended.
     pub blended: f64,
@@ -137,7 +137,8 @@ mod tests {
 
     #[test]
     fn counts_are_those_of_the_definition() {
-        let capture = synthetic_capture(400, 2000);
+        // 64 x 48: whole tiles, so that nothing is evaluated beyond the edges.
+        let capture = synthetic_capture(400, 3072);
         let positions: Vec<_> = capture
             .points
             .iter()
