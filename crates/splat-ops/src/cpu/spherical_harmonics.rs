@@ -230,6 +230,7 @@ pub(super) fn backward<T: Real>(
             .enumerate()
             .for_each(|(row, out)| {
                 if is_zero(&grad[3 * row..3 * row + 3]) {
+                    out.fill(T::ZERO);
                     return;
                 }
                 let (unit, inverse_length) = normalize(direction(dirs, row));

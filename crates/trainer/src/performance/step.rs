@@ -362,7 +362,7 @@ mod tests {
         assert_eq!(samples.steps.len(), 3);
         for (seconds, stages) in &samples.steps {
             let names: Vec<&str> = stages.iter().map(|stage| stage.name).collect();
-            for op in ["project", "spherical harmonics", "rasterize"] {
+            for op in ["project", "colours", "rasterize"] {
                 let gradient = format!("{op} gradient");
                 assert!(
                     names.contains(&op) && names.contains(&gradient.as_str()),
