@@ -29,14 +29,14 @@ use tracing::trace_span;
 use super::buffer::{Buffer, overwritten, tensor};
 use super::intersect::{CHUNK, Grid, TILE, TileLists};
 use super::real::Real;
-use super::simd::vectorized;
+use super::simd::{prefetch, vectorized};
 use crate::OpError;
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::RasterizeArgs;
 use blend::BlendTile;
 use blocks::Blocks;
 use gradient::{GradientTile, MOMENTS, Upstream};
-use splat::Splat;
+use splat::{AHEAD, Splat};
 
 pub use work::{RasterizeWork, rasterize_work};
 
@@ -412,13 +412,12 @@ struct Gradients<T> {
 }
 
 impl<T: Real> Gradients<T> {
-    /// Sums what each splat of a camera has in its tiles, in the order they were emitted, and turns that into gradients.
-    /// The camera's rows begin at `first`.
+    /// Turns what each splat of a camera has in its tiles into gradients. The camera's rows begin at `first`.
     fn reduce(&mut self, first: usize, n: usize, partials: &[T], frame: &Frame<T>, d: usize) {
         const HIDDEN: u32 = u32::MAX;
-        let Frame { lists, splats, .. } = frame;
+        let by_rank = sums_by_rank(partials, frame, MOMENTS + d);
         let mut ranks = vec![HIDDEN; n];
-        for (rank, n) in (0..).zip(&lists.order) {
+        for (rank, n) in (0..).zip(&frame.lists.order) {
             ranks[*n as usize] = rank;
         }
         let rows = first..first + n;
@@ -431,19 +430,38 @@ impl<T: Real> Gradients<T> {
             .filter(|(_, rank)| **rank != HIDDEN)
             .for_each(|(((packed, color), opacity), rank)| {
                 let rank = *rank as usize;
-                let mut moments = [T::ZERO; MOMENTS];
-                let own = lists.emitted[rank] as usize..lists.emitted[rank + 1] as usize;
-                for position in &lists.position[own] {
-                    let row = &partials[*position as usize * (MOMENTS + d)..][..MOMENTS + d];
-                    let sums = moments.iter_mut().chain(color.iter_mut());
-                    for (sum, value) in sums.zip(row) {
-                        *sum += *value;
-                    }
-                }
-                let (geometry, of_opacity) = splats[rank].gradients(moments);
+                let (moments, sums) =
+                    by_rank[rank * (MOMENTS + d)..][..MOMENTS + d].split_at(MOMENTS);
+                let moments = core::array::from_fn(|i| moments[i]);
+                let (geometry, of_opacity) = frame.splats[rank].gradients(moments);
                 packed[..2].copy_from_slice(&geometry[..2]);
                 packed[3..6].copy_from_slice(&geometry[2..]);
+                color.copy_from_slice(sums);
                 *opacity = of_opacity;
             });
     }
+}
+
+/// The sums of each splat over its tiles, in the order in which these were emitted.
+// Splat by splat front to back: so their lists lie one after the other in memory, and the sums of their tiles, which lie
+// anywhere, can be fetched ahead.
+fn sums_by_rank<T: Real>(partials: &[T], frame: &Frame<T>, width: usize) -> Vec<T> {
+    let TileLists {
+        emitted, position, ..
+    } = &frame.lists;
+    let mut sums = vec![T::ZERO; frame.splats.len() * width];
+    sums.par_chunks_exact_mut(width)
+        .with_min_len(CHUNK)
+        .enumerate()
+        .for_each(|(rank, sums)| {
+            for i in emitted[rank] as usize..emitted[rank + 1] as usize {
+                let next = position.get(i + 4 * AHEAD);
+                prefetch(partials, next.map(|next| *next as usize * width));
+                let row = &partials[position[i] as usize * width..][..width];
+                for (sum, value) in sums.iter_mut().zip(row) {
+                    *sum += *value;
+                }
+            }
+        });
+    sums
 }

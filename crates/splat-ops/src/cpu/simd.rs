@@ -45,9 +45,9 @@ pub(super) use vectorized;
 
 /// Begins to bring an item, if there is one of that index, to the processor's cache.
 #[inline(always)]
-pub(super) fn prefetch<V>(items: &[V], index: Option<&u32>) {
+pub(super) fn prefetch<V>(items: &[V], index: Option<usize>) {
     #[cfg(target_arch = "x86_64")]
-    if let Some(item) = index.and_then(|index| items.get(*index as usize)) {
+    if let Some(item) = index.and_then(|index| items.get(index)) {
         use core::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
         // SAFETY: every 64-bit x86 processor has the instruction, which reads nothing.
         unsafe { _mm_prefetch::<_MM_HINT_T0>(core::ptr::from_ref(item).cast()) }

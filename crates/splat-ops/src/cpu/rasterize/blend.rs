@@ -54,7 +54,8 @@ impl<T: Real> BlendTile<T> {
             let rank = *rank as usize;
             let splat = &view.splats[rank];
             let color = &view.colors[rank * channels..][..channels];
-            prefetch(view.splats, ranks.get(place + AHEAD));
+            let next = ranks.get(place + AHEAD);
+            prefetch(view.splats, next.map(|rank| *rank as usize));
             for at in blocks.cover(splat, &centres, &open) {
                 let at = usize::from(*at);
                 any_stopped |=

@@ -113,7 +113,8 @@ impl<T: Real> GradientTile<T> {
             let rank = *rank as usize;
             let splat = &view.splats[rank];
             let color = &view.colors[rank * channels..][..channels];
-            prefetch(view.splats, ranks.get(place.wrapping_sub(AHEAD)));
+            let next = ranks.get(place.wrapping_sub(AHEAD));
+            prefetch(view.splats, next.map(|rank| *rank as usize));
             let mut sums = [[T::ZERO; LANES]; MOMENTS];
             color_sums.fill([T::ZERO; LANES]);
             for at in blocks.before(&mut end, first + place) {
