@@ -129,6 +129,18 @@ fn windowed(
     }
 }
 
+/// Writes the values of a run that exist to the field that begins at `offset`.
+#[cube]
+fn store_run(sums: &Array<f32>, out: &mut [f32], offset: u32, axis: Axis, first: u32, along: u32) {
+    #[unroll]
+    for o in 0..RUN {
+        if axis.size > along + o as u32 {
+            let at = first + (along + o as u32) * axis.stride;
+            out[(offset + at) as usize] = sums[o];
+        }
+    }
+}
+
 #[cube]
 fn load_window(weights: &[f32], #[comptime] taps: usize, #[comptime] unrolled: bool) -> Array<f32> {
     let mut window = Array::<f32>::new(taps);
@@ -181,13 +193,7 @@ fn moments_along_rows(
                 }
             }
             windowed(&products, &window, &mut sums, taps, unrolled);
-            #[unroll]
-            for o in 0..RUN {
-                if axis.size > along + o as u32 {
-                    let at = first + (along + o as u32) * axis.stride;
-                    out[(field as u32 * axis.len + at) as usize] = sums[o];
-                }
-            }
+            store_run(&sums, out, field as u32 * axis.len, axis, first, along);
         }
     }
 }
@@ -352,13 +358,7 @@ fn fields_along_rows(
             } else {
                 windowed(&by_product, &window, &mut sums, taps, unrolled);
             }
-            #[unroll]
-            for o in 0..RUN {
-                if axis.size > along + o as u32 {
-                    let at = first + (along + o as u32) * axis.stride;
-                    out[(field as u32 * axis.len + at) as usize] = sums[o];
-                }
-            }
+            store_run(&sums, out, field as u32 * axis.len, axis, first, along);
         }
     }
 }

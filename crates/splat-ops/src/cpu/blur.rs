@@ -19,88 +19,69 @@ pub(super) fn blur<T: Real>(_: PhantomData<T>, image: FlexTensor, window: &[f64]
     let rows = Rows::<T>::new(shape, window);
     let mut blurred = overwritten::<T>(image.len());
     if !image.is_empty() {
-        let planes = rows.along::<1>(|row, [out]| out.copy_from_slice(&image[rows.range(row)]));
+        let along = rows.along(image);
         blurred
             .par_chunks_mut(rows.length)
             .enumerate()
-            .for_each(|(row, out)| rows.down::<1>(&planes, row, out));
+            .for_each(|(row, out)| rows.down(&along, row, out));
     }
     tensor(blurred, shape)
 }
 
 /// Rows of images `[B, H, W, D]`, and the window over them.
-pub(super) struct Rows<T> {
+struct Rows<T> {
     /// H.
     height: usize,
     /// W D.
-    pub(super) length: usize,
+    length: usize,
     /// D.
     pixel: usize,
-    count: usize,
     window: Vec<T>,
 }
 
 impl<T: Real> Rows<T> {
-    pub(super) fn new([b, h, w, d]: [usize; 4], window: &[f64]) -> Self {
+    fn new([_, h, w, d]: [usize; 4], window: &[f64]) -> Self {
         Self {
             height: h,
             length: w * d,
             pixel: d,
-            count: b * h,
             window: window.iter().map(|weight| T::of(*weight)).collect(),
         }
     }
 
-    pub(super) fn range(&self, row: usize) -> core::ops::Range<usize> {
-        row * self.length..(row + 1) * self.length
-    }
-
-    /// Blurs N fields along the rows: `fill` writes the fields of a row, the result holds N blurred rows
-    /// per row.
-    pub(super) fn along<const N: usize>(
-        &self,
-        fill: impl Fn(usize, [&mut [T]; N]) + Sync,
-    ) -> Vec<T> {
+    /// Blurs along the rows.
+    fn along(&self, image: &[T]) -> Vec<T> {
         let margin = self.window.len() / 2 * self.pixel;
-        let mut planes = overwritten::<T>(N * self.count * self.length);
-        planes
-            .par_chunks_mut(N * self.length)
-            .enumerate()
+        let mut blurred = overwritten::<T>(image.len());
+        blurred
+            .par_chunks_mut(self.length)
+            .zip(image.par_chunks(self.length))
             .for_each_init(
-                || core::array::from_fn::<_, N, _>(|_| vec![T::ZERO; self.length + 2 * margin]),
-                |padded, (row, out)| {
-                    fill(
-                        row,
-                        padded
-                            .each_mut()
-                            .map(|p| &mut p[margin..margin + self.length]),
-                    );
-                    for (out, padded) in out.chunks_exact_mut(self.length).zip(padded) {
-                        let sources: Vec<&[T]> = (0..self.window.len())
-                            .map(|k| &padded[k * self.pixel..][..self.length])
-                            .collect();
-                        weighted_sum(out, &sources, &self.window);
-                    }
+                || vec![T::ZERO; self.length + 2 * margin],
+                |padded, (out, row)| {
+                    padded[margin..margin + self.length].copy_from_slice(row);
+                    let sources: Vec<&[T]> = (0..self.window.len())
+                        .map(|k| &padded[k * self.pixel..][..self.length])
+                        .collect();
+                    weighted_sum(out, &sources, &self.window);
                 },
             );
-        planes
+        blurred
     }
 
-    /// Blurs the planes of [`along`](Self::along) down the columns, one row, into `out` (N rows).
-    pub(super) fn down<const N: usize>(&self, planes: &[T], row: usize, out: &mut [T]) {
+    /// Blurs one row of an image down the columns.
+    fn down(&self, image: &[T], row: usize, out: &mut [T]) {
         let radius = self.window.len() / 2;
         let (first, y) = (row - row % self.height, row % self.height);
         let inside = |k: &usize| (radius..self.height + radius).contains(&(y + k));
-        for (n, out) in out.chunks_exact_mut(self.length).enumerate() {
-            let (weights, sources): (Vec<T>, Vec<&[T]>) = (0..self.window.len())
-                .filter(inside)
-                .map(|k| {
-                    let start = ((first + y + k - radius) * N + n) * self.length;
-                    (self.window[k], &planes[start..start + self.length])
-                })
-                .unzip();
-            weighted_sum(out, &sources, &weights);
-        }
+        let (weights, sources): (Vec<T>, Vec<&[T]>) = (0..self.window.len())
+            .filter(inside)
+            .map(|k| {
+                let start = (first + y + k - radius) * self.length;
+                (self.window[k], &image[start..start + self.length])
+            })
+            .unzip();
+        weighted_sum(out, &sources, &weights);
     }
 }
 

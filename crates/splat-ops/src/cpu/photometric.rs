@@ -85,7 +85,7 @@ struct Band<'a, T> {
     slope: Option<&'a mut [T]>,
 }
 
-/// Gradient of `rendered`, given that of the means and what [`forward`] left.
+/// Gradient of `rendered`, given that of the means and what [`measure_tracked`] left.
 pub(super) fn backward<T: Real>(
     _: PhantomData<T>,
     rendered: FlexTensor,

@@ -29,7 +29,7 @@ use self::gradient::splat_backward;
 use self::splat::{Camera, Gaussian, Splat};
 use super::buffer::{Buffer, overwritten, tensor};
 use super::real::Real;
-use super::simd::{LANES, Lanes, vectorized};
+use super::simd::{LANES, Lanes, for_each_block, vectorized};
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::ProjectArgs;
 
@@ -192,21 +192,14 @@ impl<T: Real> Chunk<'_, T> {
     /// Adds the gradients through one camera; returns the camera's.
     fn add(&mut self, inputs: &Inputs<T>, camera: &Camera<T>, grad: &[T]) -> [T; CAMERA] {
         let mut of_camera = [[T::ZERO; LANES]; CAMERA];
-        let mut block = [0; LANES];
-        let mut count = 0;
-        for row in self.rows.clone() {
+        // Most splats of most views have none: culled, covered, or too faint.
+        let is_graded = |row: usize| {
             let graded = &grad[row * PROJECTED_WIDTH..][..GRADED];
-            // Most splats of most views have none: culled, covered, or too faint.
-            if graded.iter().any(|g| *g != T::ZERO) {
-                block[count] = row;
-                count += 1;
-            }
-            if count == LANES {
-                self.add_block(&block, inputs, camera, grad, &mut of_camera);
-                count = 0;
-            }
-        }
-        self.add_block(&block[..count], inputs, camera, grad, &mut of_camera);
+            graded.iter().any(|g| *g != T::ZERO)
+        };
+        for_each_block(self.rows.clone(), is_graded, |rows| {
+            self.add_block(rows, inputs, camera, grad, &mut of_camera);
+        });
         of_camera.map(|lanes| lanes.into_iter().fold(T::ZERO, |sum, value| sum + value))
     }
 

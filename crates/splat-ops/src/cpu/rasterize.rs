@@ -56,23 +56,17 @@ impl State {
     }
 }
 
-/// One camera's splats, front to back, and what became of its pixels.
-struct Frame<T> {
+/// One camera's splats, front to back.
+struct Sorted<T> {
     lists: TileLists,
-    /// By row of tiles.
-    blocks: Vec<Blocks>,
     /// By rank.
     splats: Vec<Splat<T>>,
     /// By rank, D each.
     colors: Vec<T>,
-    /// `[H, W]`: what is left of the light at each pixel. One minus alpha would lose its digits.
-    transmittance: Vec<T>,
-    /// `[H, W]`: the place, in the list of the pixel's tile, of the splat before which it stopped; `i32::MAX` where it
-    /// did not.
-    stop: Vec<i32>,
+    channels: usize,
 }
 
-impl<T: Real> Frame<T> {
+impl<T: Real> Sorted<T> {
     fn new(camera: &Camera<T>, args: &RasterizeArgs) -> Result<Self, OpError> {
         let _span = trace_span!("rasterize lists").entered();
         let (lists, footprints) =
@@ -88,16 +82,25 @@ impl<T: Real> Frame<T> {
                 let n = *n as usize;
                 color.copy_from_slice(&camera.colors[n * d..(n + 1) * d]);
             });
-        let pixels = args.size.width as usize * args.size.height as usize;
         Ok(Self {
             splats: splats.collect(),
             lists,
-            blocks: Vec::new(),
             colors,
-            transmittance: overwritten::<T>(pixels),
-            stop: overwritten::<i32>(pixels),
+            channels: d,
         })
     }
+}
+
+/// One camera's splats, and what became of its pixels.
+struct Frame<T> {
+    sorted: Sorted<T>,
+    /// By row of tiles.
+    blocks: Vec<Blocks>,
+    /// `[H, W]`: what is left of the light at each pixel. One minus alpha would lose its digits.
+    transmittance: Vec<T>,
+    /// `[H, W]`: the place, in the list of the pixel's tile, of the splat before which it stopped; `i32::MAX` where it
+    /// did not.
+    stop: Vec<i32>,
 }
 
 /// One camera's splats as the tiles read them.
@@ -114,19 +117,13 @@ struct View<'a, T> {
 }
 
 impl<'a, T: Real> View<'a, T> {
-    fn new(
-        lists: &'a TileLists,
-        splats: &'a [Splat<T>],
-        colors: &'a [T],
-        camera: &Camera<'a, T>,
-        args: &'a RasterizeArgs,
-    ) -> Self {
+    fn new(sorted: &'a Sorted<T>, background: Option<&'a [T]>, args: &'a RasterizeArgs) -> Self {
         Self {
-            lists,
-            splats,
-            colors,
-            background: camera.background,
-            channels: camera.channels,
+            lists: &sorted.lists,
+            splats: &sorted.splats,
+            colors: &sorted.colors,
+            background,
+            channels: sorted.channels,
             width: args.size.width as usize,
             height: args.size.height as usize,
             grid: Grid::new(args),
@@ -216,11 +213,8 @@ pub(super) fn forward<T: Real>(
 
     for (index, image) in image.chunks_exact_mut(h * w * (d + 1)).enumerate() {
         let camera = inputs.camera::<T>(index);
-        match Frame::new(&camera, args) {
-            Ok(mut frame) => {
-                blend(&mut frame, &camera, args, image);
-                frames.push(frame);
-            }
+        match Sorted::new(&camera, args) {
+            Ok(sorted) => frames.push(blend(sorted, camera.background, args, image)),
             Err(error) => {
                 args.errors.report(error);
                 frames.clear();
@@ -235,13 +229,20 @@ pub(super) fn forward<T: Real>(
 }
 
 /// Renders one camera's image.
-fn blend<T: Real>(frame: &mut Frame<T>, camera: &Camera<T>, args: &RasterizeArgs, image: &mut [T]) {
-    let view = View::new(&frame.lists, &frame.splats, &frame.colors, camera, args);
-    let slab = view.slab();
-    frame.blocks = image
+fn blend<T: Real>(
+    sorted: Sorted<T>,
+    background: Option<&[T]>,
+    args: &RasterizeArgs,
+    image: &mut [T],
+) -> Frame<T> {
+    let view = View::new(&sorted, background, args);
+    let (slab, pixels) = (view.slab(), view.width * view.height);
+    let mut transmittance = overwritten::<T>(pixels);
+    let mut stop = overwritten::<i32>(pixels);
+    let blocks = image
         .par_chunks_mut(slab * (view.channels + 1))
-        .zip(frame.transmittance.par_chunks_mut(slab))
-        .zip(frame.stop.par_chunks_mut(slab))
+        .zip(transmittance.par_chunks_mut(slab))
+        .zip(stop.par_chunks_mut(slab))
         .enumerate()
         .map(|(ty, ((image, transmittance), stop))| {
             let slab = Slab {
@@ -252,6 +253,12 @@ fn blend<T: Real>(frame: &mut Frame<T>, camera: &Camera<T>, args: &RasterizeArgs
             blend_row_of_tiles(&view, ty, slab)
         })
         .collect();
+    Frame {
+        sorted,
+        blocks,
+        transmittance,
+        stop,
+    }
 }
 
 vectorized! {
@@ -307,13 +314,8 @@ pub(super) fn backward<T: Real>(
         background: vec![T::ZERO; c * d],
     };
     for (index, frame) in state.frames::<T>().iter().enumerate() {
-        let view = View::new(
-            &frame.lists,
-            &frame.splats,
-            &frame.colors,
-            &inputs.camera(index),
-            args,
-        );
+        let background = inputs.camera::<T>(index).background;
+        let view = View::new(&frame.sorted, background, args);
         let upstream = Upstream {
             grad: &grad[index * pixels..(index + 1) * pixels],
             transmittance: &frame.transmittance,
@@ -321,8 +323,8 @@ pub(super) fn backward<T: Real>(
         };
         // Every (tile, splat) pair writes its own row; each splat then sums its rows in order.
         let width = MOMENTS + d;
-        let mut partials = vec![T::ZERO; frame.lists.instances() * width];
-        let slabs = split_by_tile_row(&mut partials, &frame.lists, view.grid, width);
+        let mut partials = vec![T::ZERO; view.lists.instances() * width];
+        let slabs = split_by_tile_row(&mut partials, view.lists, view.grid, width);
         let backgrounds: Vec<Vec<T>> = slabs
             .into_par_iter()
             .enumerate()
@@ -335,7 +337,7 @@ pub(super) fn backward<T: Real>(
                 *sum += value;
             }
         }
-        out.reduce(index * n, n, &partials, frame, d);
+        out.reduce(index * n, n, &partials, &frame.sorted);
     }
     [
         wanted[0].then(|| tensor(out.packed, [c, n, PROJECTED_WIDTH])),
@@ -413,11 +415,12 @@ struct Gradients<T> {
 
 impl<T: Real> Gradients<T> {
     /// Turns what each splat of a camera has in its tiles into gradients. The camera's rows begin at `first`.
-    fn reduce(&mut self, first: usize, n: usize, partials: &[T], frame: &Frame<T>, d: usize) {
+    fn reduce(&mut self, first: usize, n: usize, partials: &[T], sorted: &Sorted<T>) {
         const HIDDEN: u32 = u32::MAX;
-        let by_rank = sums_by_rank(partials, frame, MOMENTS + d);
+        let d = sorted.channels;
+        let by_rank = sums_by_rank(partials, sorted);
         let mut ranks = vec![HIDDEN; n];
-        for (rank, n) in (0..).zip(&frame.lists.order) {
+        for (rank, n) in (0..).zip(&sorted.lists.order) {
             ranks[*n as usize] = rank;
         }
         let rows = first..first + n;
@@ -433,7 +436,7 @@ impl<T: Real> Gradients<T> {
                 let (moments, sums) =
                     by_rank[rank * (MOMENTS + d)..][..MOMENTS + d].split_at(MOMENTS);
                 let moments = core::array::from_fn(|i| moments[i]);
-                let (geometry, of_opacity) = frame.splats[rank].gradients(moments);
+                let (geometry, of_opacity) = sorted.splats[rank].gradients(moments);
                 packed[..2].copy_from_slice(&geometry[..2]);
                 packed[3..6].copy_from_slice(&geometry[2..]);
                 color.copy_from_slice(sums);
@@ -445,11 +448,12 @@ impl<T: Real> Gradients<T> {
 /// The sums of each splat over its tiles, in the order in which these were emitted.
 // Splat by splat front to back: so their lists lie one after the other in memory, and the sums of their tiles, which lie
 // anywhere, can be fetched ahead.
-fn sums_by_rank<T: Real>(partials: &[T], frame: &Frame<T>, width: usize) -> Vec<T> {
+fn sums_by_rank<T: Real>(partials: &[T], sorted: &Sorted<T>) -> Vec<T> {
+    let width = MOMENTS + sorted.channels;
     let TileLists {
         emitted, position, ..
-    } = &frame.lists;
-    let mut sums = vec![T::ZERO; frame.splats.len() * width];
+    } = &sorted.lists;
+    let mut sums = vec![T::ZERO; sorted.splats.len() * width];
     sums.par_chunks_exact_mut(width)
         .with_min_len(CHUNK)
         .enumerate()

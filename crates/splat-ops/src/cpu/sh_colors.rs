@@ -13,7 +13,7 @@ use rayon::prelude::*;
 use super::buffer::{Buffer, overwritten, tensor};
 use super::math::{Vec3, dot};
 use super::real::Real;
-use super::simd::{LANES, Lanes, vectorized};
+use super::simd::{LANES, Lanes, for_each_block, vectorized};
 use super::spherical_harmonics::{
     COUNT_MAX, basis, basis_gradient, guarded_dot, is_zero, normalize,
 };
@@ -238,19 +238,10 @@ impl<T: Real> Chunk<'_, T> {
     /// Adds the gradients through one camera, given those of its colours; returns that of its centre.
     fn add(&mut self, inputs: &Inputs<T>, center: &[T], grad: &[T]) -> Vec3<T> {
         let mut of_center = [T::ZERO; 3];
-        let mut block = [0; LANES];
-        let mut count = 0;
-        for row in self.rows.clone() {
-            if !is_zero(&grad[3 * row..3 * row + 3]) {
-                block[count] = row;
-                count += 1;
-            }
-            if count == LANES {
-                self.add_block(&block, inputs, center, grad, &mut of_center);
-                count = 0;
-            }
-        }
-        self.add_block(&block[..count], inputs, center, grad, &mut of_center);
+        let is_graded = |row: usize| !is_zero(&grad[3 * row..3 * row + 3]);
+        for_each_block(self.rows.clone(), is_graded, |rows| {
+            self.add_block(rows, inputs, center, grad, &mut of_center);
+        });
         of_center
     }
 

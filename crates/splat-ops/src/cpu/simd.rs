@@ -1,5 +1,7 @@
 //! Code for the processor at hand: chosen at run time, so that one binary runs everywhere.
 
+use core::ops::Range;
+
 /// Defines a function whose body is compiled for the baseline, for AVX2 with FMA and for AVX-512, and which takes the
 /// best that the processor can run. What the body calls must be `#[inline(always)]`, or it stays compiled for the
 /// baseline.
@@ -62,3 +64,23 @@ pub(super) const LANES: usize = 32;
 
 /// One number of each of [`LANES`] rows. A loop over lanes, without branches and calls, becomes SIMD code.
 pub(super) type Lanes<T> = [T; LANES];
+
+/// Hands out those of the rows that `is_kept`, in order, up to [`LANES`] at a time.
+pub(super) fn for_each_block(
+    rows: Range<usize>,
+    is_kept: impl Fn(usize) -> bool,
+    mut visit: impl FnMut(&[usize]),
+) {
+    let (mut block, mut count) = ([0; LANES], 0);
+    for row in rows.filter(|row| is_kept(*row)) {
+        block[count] = row;
+        count += 1;
+        if count == LANES {
+            visit(&block);
+            count = 0;
+        }
+    }
+    if count > 0 {
+        visit(&block[..count]);
+    }
+}

@@ -7,6 +7,9 @@ use super::splat::{Centres, LANES, Splat, Window};
 /// Two in each row of a tile at most; a power of two, and more than are ever used, so that indices need no check.
 const MAX_BLOCKS: usize = 64;
 
+/// Blocks that a pair usually has: what memory is reserved for at first.
+const USUAL_BLOCKS: usize = 12;
+
 /// The blocks of every splat in every tile of a row of tiles: made by the forward pass, walked back by the backward.
 #[derive(Debug, Default)]
 pub(super) struct Blocks {
@@ -21,7 +24,7 @@ impl Blocks {
     /// For so many (tile, splat) pairs.
     pub(super) fn new(pairs: usize) -> Self {
         Self {
-            starts: Vec::with_capacity(12 * pairs + MAX_BLOCKS),
+            starts: Vec::with_capacity(USUAL_BLOCKS * pairs + MAX_BLOCKS),
             counts: Vec::with_capacity(pairs),
             end: 0,
         }

@@ -2,6 +2,7 @@
 
 use super::super::intersect::{Footprint, TILE};
 use super::super::real::Real;
+use super::gradient::MOMENTS;
 use crate::settings::RasterizeArgs;
 
 /// Pixels that are worked on at once, a block: half a row of a tile, wherever it begins.
@@ -108,7 +109,7 @@ impl<T: Real> Splat<T> {
     /// Gradients of screen mean, w11, w21, w22, and of the opacity, from a splat's sums of g times 1, z1, z2, z1^2, z1 z2
     /// and z2^2; see the formulas in `gradient.rs`.
     #[inline(always)]
-    pub(super) fn gradients(&self, [one, z1, z2, z11, z12, z22]: [T; 6]) -> ([T; 5], T) {
+    pub(super) fn gradients(&self, [one, z1, z2, z11, z12, z22]: [T; MOMENTS]) -> ([T; 5], T) {
         let (unit, square) = (T::of(UNIT), T::of(UNIT * UNIT));
         let Self { w11, w21, w22, .. } = *self;
         let geometry = [

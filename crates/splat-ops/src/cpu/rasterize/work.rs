@@ -5,7 +5,8 @@ use rayon::prelude::*;
 
 use super::blend::BlendTile;
 use super::blocks::Blocks;
-use super::{Camera, Frame, View};
+use super::{Camera, Sorted, View};
+use crate::backend::PROJECTED_WIDTH;
 use crate::rasterize::per_camera;
 use crate::settings::RasterizeArgs;
 use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
@@ -52,7 +53,7 @@ pub fn rasterize_work<const DC: usize, const DO: usize>(
     let mut work = RasterizeWork::default();
     for index in 0..c {
         let camera = Camera {
-            packed: &packed[index * n * 9..(index + 1) * n * 9],
+            packed: &packed[index * n * PROJECTED_WIDTH..(index + 1) * n * PROJECTED_WIDTH],
             colors: &colors[index * n * d..(index + 1) * n * d],
             opacities: &opacities[index * n..(index + 1) * n],
             background: None,
@@ -64,13 +65,13 @@ pub fn rasterize_work<const DC: usize, const DO: usize>(
 }
 
 fn of_camera(camera: &Camera<f32>, args: &RasterizeArgs) -> Result<RasterizeWork, OpError> {
-    let frame = Frame::new(camera, args)?;
-    let view = View::new(&frame.lists, &frame.splats, &frame.colors, camera, args);
+    let sorted = Sorted::new(camera, args)?;
+    let view = View::new(&sorted, None, args);
     let tiles = (0..view.grid.columns * view.grid.rows).into_par_iter();
     let blended = tiles.map(|tile| {
         let d = camera.channels;
         let mut work = RasterizeWork::default();
-        let ranks = frame.lists.tile(tile);
+        let ranks = view.lists.tile(tile);
         let tile = [tile % view.grid.columns, tile / view.grid.columns];
         // Without FMA a few pairs at a threshold may fall to its other side; for a count that is nothing.
         let blocks = &mut Blocks::new(ranks.len());
@@ -81,7 +82,7 @@ fn of_camera(camera: &Camera<f32>, args: &RasterizeArgs) -> Result<RasterizeWork
         sum.add(&tile);
         sum
     });
-    work.instances = frame.lists.instances() as u64;
+    work.instances = view.lists.instances() as u64;
     Ok(work)
 }
 
