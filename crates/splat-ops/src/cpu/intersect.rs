@@ -1,7 +1,10 @@
 //! Which splats touch which tiles, in depth order (3DGS section 6).
 //!
-//! Splats of a camera are sorted by (depth, index) once; each emits its tiles in that order, and a
-//! counting sort by tile, which is stable, leaves every tile's list in depth order.
+//! The splats that a camera sees are numbered in the order of their Gaussians, so that memory is read and written one
+//! after the other. Each emits its tiles; a counting sort brings these together tile by tile, and each tile sorts its own
+//! few by (depth, index).
+
+use std::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
@@ -40,17 +43,20 @@ fn max_pairs() -> u64 {
 #[cfg(test)]
 use tests::max_pairs;
 
+/// Parts that the counting sort is done in, at most: each counts the tiles for itself.
+const PARTS: usize = 16;
+
 /// The lists of one camera. An instance is one (splat, tile) pair.
 #[derive(Debug, Clone)]
 pub(super) struct TileLists {
-    /// Visible splats, front to back.
-    pub(super) order: Vec<u32>,
-    /// `emitted[i]..emitted[i + 1]`: the emitted instances of the i-th splat of `order`.
+    /// The Gaussian of each listed splat, ascending.
+    pub(super) listed: Vec<u32>,
+    /// `emitted[i]..emitted[i + 1]`: the emitted instances of the i-th listed splat.
     pub(super) emitted: Vec<u32>,
-    /// Where each emitted instance went when they were sorted by tile.
+    /// Where each emitted instance went when they were sorted by tile and depth.
     pub(super) position: Vec<u32>,
-    /// The place in `order` of the splat of each instance, sorted by tile, front to back in each tile.
-    ranks: Vec<u32>,
+    /// The listed splat of each instance, sorted by tile, front to back in each tile.
+    splats: Vec<u32>,
     /// `tiles[t]..tiles[t + 1]`: the sorted instances of tile t, tiles in rows.
     tiles: Vec<u32>,
 }
@@ -147,7 +153,13 @@ impl<T: Real> Footprint<T> {
             if dy[0] > dy[1] + slack {
                 continue;
             }
-            let [left, right] = self.between(dy);
+            // Most splats lie in one row of tiles, and reach as far as their bounding box does.
+            let is_whole = dy[0] == -self.half[1] && dy[1] == self.half[1];
+            let [left, right] = if is_whole {
+                [-self.half[0], self.half[0]]
+            } else {
+                self.between(dy)
+            };
             let columns = tiles_between(
                 self.mean[0] + left - slack - last,
                 self.mean[0] + right + slack,
@@ -164,11 +176,14 @@ impl<T: Real> Footprint<T> {
 #[inline(always)]
 fn tiles_between<T: Real>(low: T, high: T, count: usize) -> core::ops::Range<usize> {
     let index = |x: T| (x.wide() - 0.5) / TILE as f64;
-    let (low, high) = (index(low).ceil(), index(high).floor());
+    let high = index(high);
     if !(high >= 0.0) {
         return 0..0;
     }
-    (low as usize).min(count)..(high as usize + 1).min(count)
+    // To an integer first: as a function of the float, rounding up is a call on older processors. Casts saturate.
+    let low = index(low).max(0.0);
+    let up = usize::from(low > low as usize as f64);
+    (low as usize).saturating_add(up).min(count)..(high as usize).saturating_add(1).min(count)
 }
 
 /// The tiles that the interval `mean +- half` reaches, of `count` in a row or column.
@@ -200,9 +215,8 @@ impl Grid {
 }
 
 impl TileLists {
-    /// Lists for one camera, and the footprints of its visible splats, front to back: packed splats `[N, 9]`, colours
-    /// `[N, D]` and opacities `[N]`. A splat with a colour that is not finite is in no list: it would be in every pixel
-    /// it touches.
+    /// Lists for one camera, and the footprints of its listed splats: packed splats `[N, 9]`, colours `[N, D]` and
+    /// opacities `[N]`. A splat with a colour that is not finite is in no list: it would be in every pixel it touches.
     pub(super) fn new<T: Real>(
         packed: &[T],
         colors: &[T],
@@ -215,20 +229,19 @@ impl TileLists {
             let color = &colors[*n as usize * channels..][..channels];
             is_visible(row(*n), opacities[*n as usize], args) && color.iter().all(|c| c.is_finite())
         };
-        let mut keys: Vec<(T::Key, u32)> = (0..opacities.len() as u32)
+        let listed: Vec<u32> = (0..opacities.len() as u32)
             .into_par_iter()
             .with_min_len(CHUNK)
             .filter(is_listed)
-            .map(|n| (row(n)[2].key(), n))
             .collect();
-        // Ties by index make the order total, so an unstable sort is deterministic.
-        keys.par_sort_unstable();
-        let order: Vec<u32> = keys.into_iter().map(|(_, n)| n).collect();
-        let footprints: Vec<Footprint<T>> = order
+        let (footprints, depths): (Vec<Footprint<T>>, Vec<T>) = listed
             .par_iter()
             .with_min_len(CHUNK)
-            .map(|n| Footprint::new(row(*n), opacities[*n as usize], args))
-            .collect();
+            .map(|n| {
+                let row = row(*n);
+                (Footprint::new(row, opacities[*n as usize], args), row[2])
+            })
+            .unzip();
 
         let limit = max_pairs();
         let grid = Grid::new(args);
@@ -241,60 +254,41 @@ impl TileLists {
             check_pairs(sum(Footprint::count_tiles), limit)?;
         }
 
-        // Emit: per chunk of splats the tiles in order, and how many each splat has.
-        let chunks: Vec<(Vec<u32>, Vec<u32>)> = footprints
-            .par_chunks(CHUNK)
-            .map(|chunk| {
-                let mut tiles = Vec::with_capacity(4 * chunk.len());
-                let counts = chunk.iter().map(|footprint| {
-                    let before = tiles.len();
-                    footprint.tiles(grid, |tile| tiles.push(tile));
-                    (tiles.len() - before) as u32
-                });
-                let counts = counts.collect();
-                (tiles, counts)
+        let emission = Emission::new(&footprints, grid);
+        let (mut instances, tiles) = emission.by_tile();
+        let position: Vec<AtomicU32> = unset(instances.len());
+        let mut rest = &mut instances[..];
+        let lists: Vec<(u32, &mut [u32])> = tiles
+            .windows(2)
+            .map(|ends| {
+                let (list, after) =
+                    core::mem::take(&mut rest).split_at_mut((ends[1] - ends[0]) as usize);
+                rest = after;
+                (ends[0], list)
             })
             .collect();
-
-        // Exclusive prefix sums: instances per splat, instances per tile.
-        let mut emitted = Vec::with_capacity(order.len() + 1);
-        emitted.push(0);
-        let mut tile_counts = vec![0u32; grid.columns * grid.rows];
-        for (tiles, counts) in &chunks {
-            for count in counts {
-                emitted.push(emitted[emitted.len() - 1] + count);
-            }
-            for tile in tiles {
-                tile_counts[*tile as usize] += 1;
-            }
-        }
-        let mut tiles = Vec::with_capacity(tile_counts.len() + 1);
-        tiles.push(0);
-        for count in tile_counts {
-            tiles.push(tiles[tiles.len() - 1] + count);
-        }
-
-        // Counting sort by tile; in order of emission, so stable.
-        let total = tiles[tiles.len() - 1] as usize;
-        let mut next = tiles.clone();
-        let mut position = Vec::with_capacity(total);
-        let mut ranks = overwritten::<u32>(total);
-        let mut owners = (0u32..)
-            .zip(emitted.windows(2))
-            .flat_map(|(rank, range)| core::iter::repeat_n(rank, (range[1] - range[0]) as usize));
-        for tile in chunks.iter().flat_map(|(tiles, _)| tiles) {
-            let slot = &mut next[*tile as usize];
-            if let Some(rank) = owners.next() {
-                ranks[*slot as usize] = rank;
-            }
-            position.push(*slot);
-            *slot += 1;
-        }
+        lists
+            .into_par_iter()
+            .for_each_init(Vec::new, |keys, (first, list)| {
+                keys.clear();
+                // Instances are numbered as the splats are: equal depths are in the order of the Gaussians.
+                let depth = |instance: u32| depths[emission.owners[instance as usize] as usize];
+                keys.extend(
+                    list.iter()
+                        .map(|instance| depth(*instance).sort_key(*instance)),
+                );
+                keys.sort_unstable();
+                for ((place, splat), key) in (first..).zip(list).zip(&*keys) {
+                    let instance = T::index_of(*key) as usize;
+                    position[instance].store(place, Relaxed);
+                    *splat = emission.owners[instance];
+                }
+            });
         let lists = Self {
-            order,
-            emitted,
-            position,
-            ranks,
+            listed,
+            emitted: emission.ends,
+            position: position.into_iter().map(AtomicU32::into_inner).collect(),
+            splats: instances,
             tiles,
         };
         Ok((lists, footprints))
@@ -302,12 +296,12 @@ impl TileLists {
 
     /// Number of (splat, tile) pairs.
     pub(super) fn instances(&self) -> usize {
-        self.ranks.len()
+        self.splats.len()
     }
 
-    /// The places in `order` of a tile's splats, front to back.
+    /// The splats of a tile, front to back.
     pub(super) fn tile(&self, tile: usize) -> &[u32] {
-        &self.ranks[self.tiles[tile] as usize..self.tiles[tile + 1] as usize]
+        &self.splats[self.tiles[tile] as usize..self.tiles[tile + 1] as usize]
     }
 
     /// The sorted instances of a row of tiles.
@@ -315,6 +309,122 @@ impl TileLists {
         let [first, last] = [ty, ty + 1].map(|row| self.tiles[row * grid.columns] as usize);
         first..last
     }
+}
+
+/// The tiles of all splats, in the order of the splats.
+struct Emission {
+    /// By instance.
+    tiles: Vec<u32>,
+    /// By instance: its splat.
+    owners: Vec<u32>,
+    /// `ends[i]..ends[i + 1]`: the instances of splat i.
+    ends: Vec<u32>,
+    grid: Grid,
+}
+
+impl Emission {
+    fn new<T: Real>(footprints: &[Footprint<T>], grid: Grid) -> Self {
+        let chunks: Vec<(Vec<u32>, Vec<u32>)> = footprints
+            .par_chunks(CHUNK)
+            .map(|chunk| {
+                let mut tiles = Vec::with_capacity(4 * chunk.len());
+                let ends = chunk.iter().map(|footprint| {
+                    footprint.tiles(grid, |tile| tiles.push(tile));
+                    tiles.len() as u32
+                });
+                let ends = ends.collect();
+                (tiles, ends)
+            })
+            .collect();
+        let total = chunks.iter().map(|(tiles, _)| tiles.len()).sum();
+        let mut ends = overwritten::<u32>(footprints.len() + 1);
+        let [mut tiles, mut owners] = [(); 2].map(|()| overwritten::<u32>(total));
+        ends[0] = 0;
+        let (mut of_tiles, mut of_owners) = (&mut tiles[..], &mut owners[..]);
+        let mut first = 0;
+        let parts: Vec<_> = chunks
+            .iter()
+            .zip(ends[1..].chunks_mut(CHUNK))
+            .enumerate()
+            .map(|(chunk, (emitted, ends))| {
+                let [tiles, owners] = [&mut of_tiles, &mut of_owners].map(|all| {
+                    let (part, rest) = core::mem::take(all).split_at_mut(emitted.0.len());
+                    *all = rest;
+                    part
+                });
+                let start = first;
+                first += emitted.0.len() as u32;
+                (chunk * CHUNK, start, emitted, tiles, owners, ends)
+            })
+            .collect();
+        parts
+            .into_par_iter()
+            .for_each(|(splat, start, emitted, tiles, owners, ends)| {
+                tiles.copy_from_slice(&emitted.0);
+                let mut done = 0;
+                for ((end, own), splat) in ends.iter_mut().zip(&emitted.1).zip(splat as u32..) {
+                    owners[done..*own as usize].fill(splat);
+                    done = *own as usize;
+                    *end = start + own;
+                }
+            });
+        Self {
+            tiles,
+            owners,
+            ends,
+            grid,
+        }
+    }
+
+    /// The instances, brought together tile by tile in the order in which they were emitted, and where each tile's begin
+    /// and the last one's end.
+    fn by_tile(&self) -> (Vec<u32>, Vec<u32>) {
+        let length = self.tiles.len().div_ceil(PARTS).max(CHUNK);
+        let count = self.grid.columns * self.grid.rows;
+        let mut counts: Vec<Vec<u32>> = self
+            .tiles
+            .par_chunks(length)
+            .map(|tiles| {
+                let mut counts = vec![0; count];
+                for tile in tiles {
+                    counts[*tile as usize] += 1;
+                }
+                counts
+            })
+            .collect();
+        // From how many there are to where they go: tile by tile, and in a tile part by part.
+        let mut starts = Vec::with_capacity(count + 1);
+        let mut next = 0;
+        for tile in 0..count {
+            starts.push(next);
+            for counts in &mut counts {
+                let own = core::mem::replace(&mut counts[tile], next);
+                next += own;
+            }
+        }
+        starts.push(next);
+        // The places of a part are anywhere, but no two parts have one in common.
+        let sorted: Vec<AtomicU32> = unset(self.tiles.len());
+        self.tiles
+            .par_chunks(length)
+            .zip(counts)
+            .enumerate()
+            .for_each(|(part, (tiles, mut next))| {
+                for (tile, instance) in tiles.iter().zip((part * length) as u32..) {
+                    let place = &mut next[*tile as usize];
+                    sorted[*place as usize].store(instance, Relaxed);
+                    *place += 1;
+                }
+            });
+        let sorted = sorted.into_iter().map(AtomicU32::into_inner).collect();
+        (sorted, starts)
+    }
+}
+
+/// Memory that several threads write, each its own places. Every place is written before any is read.
+fn unset(len: usize) -> Vec<AtomicU32> {
+    let values = overwritten::<u32>(len).into_iter();
+    values.map(AtomicU32::new).collect()
 }
 
 #[cfg(test)]

@@ -8,7 +8,7 @@
 //! image += c alpha T;  T *= 1 - alpha
 //! ```
 //!
-//! Splats are prepared once per view, in depth order. Of a tile's rows those pixels only are worked on that a splat's
+//! Splats are prepared once per view. Of a tile's rows those pixels only are worked on that a splat's
 //! ellipse reaches, in blocks of eight, in loops of fixed width without branches that the compiler turns into SIMD code
 //! for the processor it finds at run time.
 
@@ -56,28 +56,27 @@ impl State {
     }
 }
 
-/// One camera's splats, front to back.
-struct Sorted<T> {
+/// The splats that one camera sees.
+struct Listed<T> {
     lists: TileLists,
-    /// By rank.
     splats: Vec<Splat<T>>,
-    /// By rank, D each.
+    /// D of each splat.
     colors: Vec<T>,
     channels: usize,
 }
 
-impl<T: Real> Sorted<T> {
+impl<T: Real> Listed<T> {
     fn new(camera: &Camera<T>, args: &RasterizeArgs) -> Result<Self, OpError> {
         let _span = trace_span!("rasterize lists").entered();
         let (lists, footprints) =
             TileLists::new(camera.packed, camera.colors, camera.opacities, args)?;
         let splats = footprints.par_iter().with_min_len(CHUNK).map(Splat::new);
         let d = camera.channels;
-        let mut colors = overwritten::<T>(lists.order.len() * d);
+        let mut colors = overwritten::<T>(lists.listed.len() * d);
         colors
             .par_chunks_exact_mut(d)
             .with_min_len(CHUNK)
-            .zip(&lists.order)
+            .zip(&lists.listed)
             .for_each(|(color, n)| {
                 let n = *n as usize;
                 color.copy_from_slice(&camera.colors[n * d..(n + 1) * d]);
@@ -89,11 +88,28 @@ impl<T: Real> Sorted<T> {
             channels: d,
         })
     }
+
+    /// Sums a splat's partial gradients over its tiles, in the order in which these were emitted.
+    fn sum(&self, splat: usize, partials: &[T], sums: &mut [T]) {
+        let TileLists {
+            emitted, position, ..
+        } = &self.lists;
+        sums.fill(T::ZERO);
+        for i in emitted[splat] as usize..emitted[splat + 1] as usize {
+            // They lie anywhere; those of the next splats follow in `position`.
+            let next = position.get(i + 4 * AHEAD);
+            prefetch(partials, next.map(|next| *next as usize * sums.len()));
+            let row = &partials[position[i] as usize * sums.len()..][..sums.len()];
+            for (sum, value) in sums.iter_mut().zip(row) {
+                *sum += *value;
+            }
+        }
+    }
 }
 
 /// One camera's splats, and what became of its pixels.
 struct Frame<T> {
-    sorted: Sorted<T>,
+    listed: Listed<T>,
     /// By row of tiles.
     blocks: Vec<Blocks>,
     /// `[H, W]`: what is left of the light at each pixel. One minus alpha would lose its digits.
@@ -117,13 +133,13 @@ struct View<'a, T> {
 }
 
 impl<'a, T: Real> View<'a, T> {
-    fn new(sorted: &'a Sorted<T>, background: Option<&'a [T]>, args: &'a RasterizeArgs) -> Self {
+    fn new(listed: &'a Listed<T>, background: Option<&'a [T]>, args: &'a RasterizeArgs) -> Self {
         Self {
-            lists: &sorted.lists,
-            splats: &sorted.splats,
-            colors: &sorted.colors,
+            lists: &listed.lists,
+            splats: &listed.splats,
+            colors: &listed.colors,
             background,
-            channels: sorted.channels,
+            channels: listed.channels,
             width: args.size.width as usize,
             height: args.size.height as usize,
             grid: Grid::new(args),
@@ -213,8 +229,8 @@ pub(super) fn forward<T: Real>(
 
     for (index, image) in image.chunks_exact_mut(h * w * (d + 1)).enumerate() {
         let camera = inputs.camera::<T>(index);
-        match Sorted::new(&camera, args) {
-            Ok(sorted) => frames.push(blend(sorted, camera.background, args, image)),
+        match Listed::new(&camera, args) {
+            Ok(listed) => frames.push(blend(listed, camera.background, args, image)),
             Err(error) => {
                 args.errors.report(error);
                 frames.clear();
@@ -230,12 +246,12 @@ pub(super) fn forward<T: Real>(
 
 /// Renders one camera's image.
 fn blend<T: Real>(
-    sorted: Sorted<T>,
+    listed: Listed<T>,
     background: Option<&[T]>,
     args: &RasterizeArgs,
     image: &mut [T],
 ) -> Frame<T> {
-    let view = View::new(&sorted, background, args);
+    let view = View::new(&listed, background, args);
     let (slab, pixels) = (view.slab(), view.width * view.height);
     let mut transmittance = overwritten::<T>(pixels);
     let mut stop = overwritten::<i32>(pixels);
@@ -254,7 +270,7 @@ fn blend<T: Real>(
         })
         .collect();
     Frame {
-        sorted,
+        listed,
         blocks,
         transmittance,
         stop,
@@ -286,8 +302,8 @@ fn blend_row<T: Real, const FMA: bool>(
     let mut tile = BlendTile::new(channels);
     let mut blocks = Blocks::new(view.lists.row_of_tiles(ty, view.grid).len());
     for tx in 0..view.grid.columns {
-        let ranks = view.lists.tile(ty * view.grid.columns + tx);
-        tile.blend::<FMA>(view, ranks, [tx, ty], channels, &mut blocks, &mut ());
+        let list = view.lists.tile(ty * view.grid.columns + tx);
+        tile.blend::<FMA>(view, list, [tx, ty], channels, &mut blocks, &mut ());
         tile.store(view, [tx, ty], &mut slab, channels);
     }
     blocks
@@ -315,7 +331,7 @@ pub(super) fn backward<T: Real>(
     };
     for (index, frame) in state.frames::<T>().iter().enumerate() {
         let background = inputs.camera::<T>(index).background;
-        let view = View::new(&frame.sorted, background, args);
+        let view = View::new(&frame.listed, background, args);
         let upstream = Upstream {
             grad: &grad[index * pixels..(index + 1) * pixels],
             transmittance: &frame.transmittance,
@@ -337,7 +353,7 @@ pub(super) fn backward<T: Real>(
                 *sum += value;
             }
         }
-        out.reduce(index * n, n, &partials, &frame.sorted);
+        out.reduce(index * n, n, &partials, &frame.listed);
     }
     [
         wanted[0].then(|| tensor(out.packed, [c, n, PROJECTED_WIDTH])),
@@ -376,14 +392,14 @@ fn row_backward<T: Real, const FMA: bool>(
     let mut tile = GradientTile::new(channels);
     let (mut first, mut end) = (0, 0);
     for tx in 0..view.grid.columns {
-        let ranks = view.lists.tile(ty * view.grid.columns + tx);
-        let length = ranks.len() * (MOMENTS + channels);
+        let list = view.lists.tile(ty * view.grid.columns + tx);
+        let length = list.len() * (MOMENTS + channels);
         let (sums, rest) = core::mem::take(&mut partials).split_at_mut(length);
         partials = rest;
         tile.load(view, upstream, [tx, ty], channels, &mut background);
-        end += blocks.count(first..first + ranks.len());
-        tile.walk::<FMA>(view, ranks, [tx, ty], channels, (blocks, first, end), sums);
-        first += ranks.len();
+        end += blocks.count(first..first + list.len());
+        tile.walk::<FMA>(view, list, [tx, ty], channels, (blocks, first, end), sums);
+        first += list.len();
     }
     background
 }
@@ -415,57 +431,31 @@ struct Gradients<T> {
 
 impl<T: Real> Gradients<T> {
     /// Turns what each splat of a camera has in its tiles into gradients. The camera's rows begin at `first`.
-    fn reduce(&mut self, first: usize, n: usize, partials: &[T], sorted: &Sorted<T>) {
-        const HIDDEN: u32 = u32::MAX;
-        let d = sorted.channels;
-        let by_rank = sums_by_rank(partials, sorted);
-        let mut ranks = vec![HIDDEN; n];
-        for (rank, n) in (0..).zip(&sorted.lists.order) {
-            ranks[*n as usize] = rank;
-        }
+    fn reduce(&mut self, first: usize, n: usize, partials: &[T], frame: &Listed<T>) {
+        let d = frame.channels;
         let rows = first..first + n;
         self.packed[rows.start * PROJECTED_WIDTH..rows.end * PROJECTED_WIDTH]
-            .par_chunks_exact_mut(PROJECTED_WIDTH)
-            .zip(self.colors[rows.start * d..rows.end * d].par_chunks_exact_mut(d))
-            .zip(&mut self.opacities[rows])
-            .zip(&ranks)
-            .with_min_len(CHUNK)
-            .filter(|(_, rank)| **rank != HIDDEN)
-            .for_each(|(((packed, color), opacity), rank)| {
-                let rank = *rank as usize;
-                let (moments, sums) =
-                    by_rank[rank * (MOMENTS + d)..][..MOMENTS + d].split_at(MOMENTS);
-                let moments = core::array::from_fn(|i| moments[i]);
-                let (geometry, of_opacity) = sorted.splats[rank].gradients(moments);
-                packed[..2].copy_from_slice(&geometry[..2]);
-                packed[3..6].copy_from_slice(&geometry[2..]);
-                color.copy_from_slice(sums);
-                *opacity = of_opacity;
+            .par_chunks_mut(CHUNK * PROJECTED_WIDTH)
+            .zip(self.colors[rows.start * d..rows.end * d].par_chunks_mut(CHUNK * d))
+            .zip(self.opacities[rows].par_chunks_mut(CHUNK))
+            .enumerate()
+            .for_each(|(chunk, ((packed, colors), opacities))| {
+                let first = chunk * CHUNK;
+                let listed = &frame.lists.listed;
+                let at = |n: usize| listed.partition_point(|listed| (*listed as usize) < n);
+                let mut sums = vec![T::ZERO; MOMENTS + d];
+                for splat in at(first)..at(first + opacities.len()) {
+                    frame.sum(splat, partials, &mut sums);
+                    let (moments, of_color) = sums.split_at(MOMENTS);
+                    let moments = core::array::from_fn(|i| moments[i]);
+                    let (geometry, of_opacity) = frame.splats[splat].gradients(moments);
+                    let row = listed[splat] as usize - first;
+                    let packed = &mut packed[row * PROJECTED_WIDTH..][..PROJECTED_WIDTH];
+                    packed[..2].copy_from_slice(&geometry[..2]);
+                    packed[3..6].copy_from_slice(&geometry[2..]);
+                    colors[row * d..][..d].copy_from_slice(of_color);
+                    opacities[row] = of_opacity;
+                }
             });
     }
-}
-
-/// The sums of each splat over its tiles, in the order in which these were emitted.
-// Splat by splat front to back: so their lists lie one after the other in memory, and the sums of their tiles, which lie
-// anywhere, can be fetched ahead.
-fn sums_by_rank<T: Real>(partials: &[T], sorted: &Sorted<T>) -> Vec<T> {
-    let width = MOMENTS + sorted.channels;
-    let TileLists {
-        emitted, position, ..
-    } = &sorted.lists;
-    let mut sums = vec![T::ZERO; sorted.splats.len() * width];
-    sums.par_chunks_exact_mut(width)
-        .with_min_len(CHUNK)
-        .enumerate()
-        .for_each(|(rank, sums)| {
-            for i in emitted[rank] as usize..emitted[rank + 1] as usize {
-                let next = position.get(i + 4 * AHEAD);
-                prefetch(partials, next.map(|next| *next as usize * width));
-                let row = &partials[position[i] as usize * width..][..width];
-                for (sum, value) in sums.iter_mut().zip(row) {
-                    *sum += *value;
-                }
-            }
-        });
-    sums
 }

@@ -30,11 +30,13 @@ pub(crate) trait Real:
 {
     const ZERO: Self;
     const ONE: Self;
-    /// What [`key`](Self::key) makes.
-    type Key: Ord + Copy + Send + Sync;
+    /// What [`sort_key`](Self::sort_key) makes.
+    type SortKey: Ord + Copy + Send + Sync;
 
-    /// An integer that sorts as the number does (negative ones too).
-    fn key(self) -> Self::Key;
+    /// An integer that sorts as the number does (negative ones too), and equal numbers as `index` does.
+    fn sort_key(self, index: u32) -> Self::SortKey;
+    /// The index in a key.
+    fn index_of(key: Self::SortKey) -> u32;
     /// The nearest integer, ties to even, of a number from 0 to a million.
     fn nearest(self) -> i32;
     /// The nearest value of this precision.
@@ -72,12 +74,17 @@ pub(crate) trait Real:
 impl Real for f64 {
     const ZERO: Self = 0.0;
     const ONE: Self = 1.0;
-    type Key = i64;
+    type SortKey = i128;
 
     #[inline(always)]
-    fn key(self) -> i64 {
+    fn sort_key(self, index: u32) -> i128 {
         let bits = self.to_bits() as i64;
-        bits ^ (((bits >> 63) as u64) >> 1) as i64
+        let key = bits ^ (((bits >> 63) as u64) >> 1) as i64;
+        (i128::from(key) << 32) | i128::from(index)
+    }
+    #[inline(always)]
+    fn index_of(key: i128) -> u32 {
+        key as u32
     }
     #[inline(always)]
     fn nearest(self) -> i32 {
@@ -128,12 +135,17 @@ impl Real for f64 {
 impl Real for f32 {
     const ZERO: Self = 0.0;
     const ONE: Self = 1.0;
-    type Key = i32;
+    type SortKey = i64;
 
     #[inline(always)]
-    fn key(self) -> i32 {
+    fn sort_key(self, index: u32) -> i64 {
         let bits = self.to_bits() as i32;
-        bits ^ (((bits >> 31) as u32) >> 1) as i32
+        let key = bits ^ (((bits >> 31) as u32) >> 1) as i32;
+        (i64::from(key) << 32) | i64::from(index)
+    }
+    #[inline(always)]
+    fn index_of(key: i64) -> u32 {
+        key as u32
     }
     #[inline(always)]
     fn nearest(self) -> i32 {

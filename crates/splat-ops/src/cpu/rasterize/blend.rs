@@ -38,7 +38,7 @@ impl<T: Real> BlendTile<T> {
     pub(super) fn blend<const FMA: bool>(
         &mut self,
         view: &View<T>,
-        ranks: &[u32],
+        list: &[u32],
         tile: [usize; 2],
         channels: usize,
         blocks: &mut Blocks,
@@ -50,12 +50,12 @@ impl<T: Real> BlendTile<T> {
         let mut open = self.open();
         let mut any_stopped = 0;
 
-        for (place, rank) in ranks.iter().enumerate() {
-            let rank = *rank as usize;
-            let splat = &view.splats[rank];
-            let color = &view.colors[rank * channels..][..channels];
-            let next = ranks.get(place + AHEAD);
-            prefetch(view.splats, next.map(|rank| *rank as usize));
+        for (place, index) in list.iter().enumerate() {
+            let index = *index as usize;
+            let splat = &view.splats[index];
+            let color = &view.colors[index * channels..][..channels];
+            let next = list.get(place + AHEAD);
+            prefetch(view.splats, next.map(|index| *index as usize));
             for at in blocks.cover(splat, &centres, &open) {
                 let at = usize::from(*at);
                 any_stopped |=
@@ -64,7 +64,7 @@ impl<T: Real> BlendTile<T> {
             if place % LOOK == LOOK - 1 && any_stopped != 0 {
                 open = self.open();
                 if open.to.iter().all(|to| *to == 0) {
-                    blocks.skip(ranks.len() - 1 - place);
+                    blocks.skip(list.len() - 1 - place);
                     break;
                 }
                 any_stopped = 0;

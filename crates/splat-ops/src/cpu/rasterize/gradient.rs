@@ -98,7 +98,7 @@ impl<T: Real> GradientTile<T> {
     pub(super) fn walk<const FMA: bool>(
         &mut self,
         view: &View<T>,
-        ranks: &[u32],
+        list: &[u32],
         tile: [usize; 2],
         channels: usize,
         (blocks, first, mut end): (&Blocks, usize, usize),
@@ -109,12 +109,12 @@ impl<T: Real> GradientTile<T> {
         let centres = Centres::<T>::new(tile);
         let mut color_sums = vec![[T::ZERO; LANES]; channels];
 
-        for (place, rank) in ranks.iter().enumerate().rev() {
-            let rank = *rank as usize;
-            let splat = &view.splats[rank];
-            let color = &view.colors[rank * channels..][..channels];
-            let next = ranks.get(place.wrapping_sub(AHEAD));
-            prefetch(view.splats, next.map(|rank| *rank as usize));
+        for (place, index) in list.iter().enumerate().rev() {
+            let index = *index as usize;
+            let splat = &view.splats[index];
+            let color = &view.colors[index * channels..][..channels];
+            let next = list.get(place.wrapping_sub(AHEAD));
+            prefetch(view.splats, next.map(|index| *index as usize));
             let mut sums = [[T::ZERO; LANES]; MOMENTS];
             color_sums.fill([T::ZERO; LANES]);
             for at in blocks.before(&mut end, first + place) {

@@ -5,7 +5,7 @@ use rayon::prelude::*;
 
 use super::blend::BlendTile;
 use super::blocks::Blocks;
-use super::{Camera, Sorted, View};
+use super::{Camera, Listed, View};
 use crate::backend::PROJECTED_WIDTH;
 use crate::rasterize::per_camera;
 use crate::settings::RasterizeArgs;
@@ -65,17 +65,17 @@ pub fn rasterize_work<const DC: usize, const DO: usize>(
 }
 
 fn of_camera(camera: &Camera<f32>, args: &RasterizeArgs) -> Result<RasterizeWork, OpError> {
-    let sorted = Sorted::new(camera, args)?;
-    let view = View::new(&sorted, None, args);
+    let listed = Listed::new(camera, args)?;
+    let view = View::new(&listed, None, args);
     let tiles = (0..view.grid.columns * view.grid.rows).into_par_iter();
     let blended = tiles.map(|tile| {
         let d = camera.channels;
         let mut work = RasterizeWork::default();
-        let ranks = view.lists.tile(tile);
+        let list = view.lists.tile(tile);
         let tile = [tile % view.grid.columns, tile / view.grid.columns];
         // Without FMA a few pairs at a threshold may fall to its other side; for a count that is nothing.
-        let blocks = &mut Blocks::new(ranks.len());
-        BlendTile::new(d).blend::<false>(&view, ranks, tile, d, blocks, &mut work);
+        let blocks = &mut Blocks::new(list.len());
+        BlendTile::new(d).blend::<false>(&view, list, tile, d, blocks, &mut work);
         work
     });
     let mut work = blended.reduce(RasterizeWork::default, |mut sum, tile| {
