@@ -1,5 +1,6 @@
 //! The `splat` program; see [`splat_trainer::cli`].
 
+use std::ffi::{c_int, c_long};
 use std::process::ExitCode;
 
 /// A step allocates and frees megabytes dozens of times, which the system's allocator hands back to
@@ -7,6 +8,17 @@ use std::process::ExitCode;
 #[global_allocator]
 static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
 
+/// `mi_option_purge_delay` of mimalloc.h: milliseconds until free memory goes back to the kernel, -1 for never.
+const PURGE_DELAY: c_int = 15;
+
+unsafe extern "C" {
+    /// Of the allocator above, whose Rust crate has no name for it.
+    fn mi_option_set(option: c_int, value: c_long);
+}
+
 fn main() -> ExitCode {
+    // The next step needs what this one frees. Fetching it anew is a tenth of a step of a million Gaussians.
+    // SAFETY: no other thread is there yet; the number is an option of the version that the lock file names.
+    unsafe { mi_option_set(PURGE_DELAY, -1) };
     splat_trainer::cli::main()
 }

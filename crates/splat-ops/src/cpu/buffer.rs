@@ -3,6 +3,7 @@
 use burn::backend::TensorMetadata;
 use burn::backend::flex::FlexTensor;
 use burn::tensor::{Element, TensorData};
+use rayon::prelude::*;
 
 use super::real::Real;
 
@@ -12,12 +13,25 @@ pub(super) fn overwritten<T: Overwritten>(len: usize) -> Vec<T> {
     if super::poison::is_on() {
         return vec![T::POISON; len];
     }
-    vec![T::CLEAR; len]
+    zeros(len)
+}
+
+/// Zeros, written by all threads where they are many: a step asks for more than one thread clears in the meantime.
+pub(super) fn zeros<T: Overwritten>(len: usize) -> Vec<T> {
+    const BLOCK: usize = 1024;
+    if len < 64 * BLOCK {
+        return vec![T::CLEAR; len];
+    }
+    let blocks = rayon::iter::repeat_n([T::CLEAR; BLOCK], len.div_ceil(BLOCK));
+    let blocks: Vec<[T; BLOCK]> = blocks.collect();
+    let mut values = bytemuck::allocation::cast_vec(blocks);
+    values.truncate(len);
+    values
 }
 
 /// What [`overwritten`] memory holds before it is written.
-pub(crate) trait Overwritten: Copy {
-    /// Zero, which costs nothing: fresh pages are.
+pub(crate) trait Overwritten: bytemuck::Pod + Send + Sync {
+    /// Zero.
     const CLEAR: Self;
     /// NaN, or for an index one far outside of any list.
     #[cfg(test)]

@@ -27,7 +27,7 @@ use rayon::prelude::*;
 
 use self::gradient::splat_backward;
 use self::splat::{Camera, Gaussian, Splat};
-use super::buffer::{Buffer, overwritten, tensor};
+use super::buffer::{Buffer, overwritten, tensor, zeros};
 use super::real::Real;
 use super::simd::{LANES, Lanes, for_each_block, vectorized};
 use crate::backend::PROJECTED_WIDTH;
@@ -245,7 +245,7 @@ pub(super) fn backward<T: Real>(
     let grad = grad.slice::<T>();
     let (c, n) = (inputs.cameras.len(), inputs.count());
 
-    let [mut means, mut quats, mut scales] = [3, 4, 3].map(|width| vec![T::ZERO; n * width]);
+    let [mut means, mut quats, mut scales] = [3, 4, 3].map(|width| zeros::<T>(n * width));
     let of_cameras: Vec<Vec<[T; CAMERA]>> = means
         .par_chunks_mut(3 * CHUNK)
         .zip(quats.par_chunks_mut(4 * CHUNK))

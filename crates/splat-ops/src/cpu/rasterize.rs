@@ -26,7 +26,7 @@ use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 use tracing::trace_span;
 
-use super::buffer::{Buffer, overwritten, tensor};
+use super::buffer::{Buffer, overwritten, tensor, zeros};
 use super::intersect::{CHUNK, Grid, TILE, TileLists};
 use super::real::Real;
 use super::simd::{prefetch, vectorized};
@@ -324,9 +324,9 @@ pub(super) fn backward<T: Real>(
     let grad = Buffer::new(grad_output);
     let grad = grad.slice::<T>();
     let mut out = Gradients {
-        packed: vec![T::ZERO; c * n * PROJECTED_WIDTH],
-        colors: vec![T::ZERO; c * n * d],
-        opacities: vec![T::ZERO; c * n],
+        packed: zeros(c * n * PROJECTED_WIDTH),
+        colors: zeros(c * n * d),
+        opacities: zeros(c * n),
         background: vec![T::ZERO; c * d],
     };
     for (index, frame) in state.frames::<T>().iter().enumerate() {
@@ -339,7 +339,7 @@ pub(super) fn backward<T: Real>(
         };
         // Every (tile, splat) pair writes its own row; each splat then sums its rows in order.
         let width = MOMENTS + d;
-        let mut partials = vec![T::ZERO; view.lists.instances() * width];
+        let mut partials = overwritten::<T>(view.lists.instances() * width);
         let slabs = split_by_tile_row(&mut partials, view.lists, view.grid, width);
         let backgrounds: Vec<Vec<T>> = slabs
             .into_par_iter()

@@ -10,7 +10,7 @@ use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
-use super::buffer::{Buffer, overwritten, tensor};
+use super::buffer::{Buffer, overwritten, tensor, zeros};
 use super::math::{Vec3, dot};
 use super::real::Real;
 use super::simd::{LANES, Lanes, for_each_block, vectorized};
@@ -336,10 +336,10 @@ pub(super) fn backward<T: Real>(
     let grad = grad.slice::<T>();
     let (c, n) = (inputs.centers.len() / 3, inputs.count());
 
-    let zeros = |wanted: bool, width: usize| vec![T::ZERO; if wanted { n * width } else { 0 }];
-    let mut sh0 = zeros(wanted[0], 3);
-    let mut rest = zeros(wanted[1], 3 * inputs.stored);
-    let mut means = zeros(wanted[2], 3);
+    let rows = |wanted: bool, width: usize| zeros::<T>(if wanted { n * width } else { 0 });
+    let mut sh0 = rows(wanted[0], 3);
+    let mut rest = rows(wanted[1], 3 * inputs.stored);
+    let mut means = rows(wanted[2], 3);
     let mut parts = [
         slabs(&mut sh0, n, 3),
         slabs(&mut rest, n, 3 * inputs.stored),

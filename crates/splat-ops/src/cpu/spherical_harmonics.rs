@@ -8,7 +8,7 @@ use core::marker::PhantomData;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
-use super::buffer::{Buffer, overwritten, tensor};
+use super::buffer::{Buffer, overwritten, tensor, zeros};
 use super::math::{Vec3, dot, largest, over, scale};
 use super::real::Real;
 use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
@@ -142,7 +142,7 @@ pub(super) fn forward<T: Real>(
     let [c, _, _] = dirs.dims();
     let (coeffs, dirs) = (coeffs.slice::<T>(), dirs.slice::<T>());
     let count = sh_coefficient_count(degree);
-    let mut colors = vec![T::ZERO; c * n * 3];
+    let mut colors = zeros::<T>(c * n * 3);
     colors
         .par_chunks_mut(3)
         .with_min_len(CHUNK)
@@ -198,7 +198,7 @@ pub(super) fn backward<T: Real>(
     // color = sum_i B_i(d) coeff_i: a coefficient's gradient is B_i(d) times the colour's, summed
     // over the cameras.
     let grad_coeffs = wanted[0].then(|| {
-        let mut values = vec![T::ZERO; n * k * 3];
+        let mut values = zeros::<T>(n * k * 3);
         values
             .par_chunks_mut(k * 3)
             .with_min_len(CHUNK)
