@@ -5,6 +5,7 @@ use burn::module::ParamGroup;
 use burn::optim::ModuleOptimizer;
 use burn::optim::lr_scheduler::module_lr_scheduler::{ModuleLearningRate, ModuleLrScheduler};
 use serde::{Deserialize, Serialize};
+use splat_ops::AdamRows;
 
 use crate::adam::{EditLog, SplatAdam};
 
@@ -117,16 +118,18 @@ impl LearningRates {
     }
 }
 
-/// A module optimiser with one [`SplatAdam`] per field, and the logs through which density control
+/// A module optimiser with one [`SplatAdam`] per field, stepping `rows`, and the logs through which density control
 /// tells them of edited rows, in the order of [`Field::ALL`].
-pub fn splat_optimizer() -> (ModuleOptimizer, [EditLog; 6]) {
+pub fn splat_optimizer(rows: AdamRows) -> (ModuleOptimizer, [EditLog; 6]) {
     let logs: [EditLog; 6] = Default::default();
     let fallback = ModuleOptimizer::from(SplatAdam::new(EditLog::default()));
     let optimizer = Field::ALL
         .into_iter()
         .zip(&logs)
         .fold(fallback, |optimizer, (field, log)| {
-            optimizer.with_group(field.group(), SplatAdam::new(log.clone()), None)
+            let mut adam = SplatAdam::new(log.clone());
+            adam.rows = rows;
+            optimizer.with_group(field.group(), adam, None)
         });
     (optimizer, logs)
 }

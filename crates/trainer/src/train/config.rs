@@ -2,6 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 use splat_model::density::AdaptiveSettings;
+use splat_model::ops::AdamRows;
 use splat_model::{InitSettings, LearningRates, RenderSettings};
 
 /// More would leave no photo anything to see.
@@ -31,6 +32,8 @@ pub struct TrainConfig {
     pub background: Option<[f32; 3]>,
     /// Weight of 1 - SSIM against L1 in the default loss. Default 0.2.
     pub ssim_weight: f64,
+    /// Adam steps only the Gaussians that the view saw, see [`AdamRows::Seen`]. Default false.
+    pub seen_rows_only: bool,
     /// The first Gaussians.
     pub init: InitSettings,
     /// Learning rates.
@@ -51,6 +54,7 @@ impl Default for TrainConfig {
             antialias: false,
             background: None,
             ssim_weight: 0.2,
+            seen_rows_only: false,
             init: InitSettings::default(),
             rates: LearningRates::default(),
             density: AdaptiveSettings::default(),
@@ -66,6 +70,15 @@ impl TrainConfig {
             antialias: self.antialias,
             background: self.background,
             ..RenderSettings::default()
+        }
+    }
+
+    /// Which Gaussians the optimiser steps.
+    pub fn adam_rows(&self) -> AdamRows {
+        if self.seen_rows_only {
+            AdamRows::Seen
+        } else {
+            AdamRows::All
         }
     }
 

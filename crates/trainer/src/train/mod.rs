@@ -293,7 +293,7 @@ struct State {
 
 impl State {
     fn new(config: &TrainConfig, run: RunShape, loss: &LossTerms) -> Self {
-        let (optimizer, edits) = splat_optimizer();
+        let (optimizer, edits) = splat_optimizer(config.adam_rows());
         Self {
             optimizer,
             edits,
