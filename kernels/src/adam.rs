@@ -9,6 +9,7 @@
 
 use cubecl::prelude::*;
 
+use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 
 /// The numbers of one step; the bias corrections are in `rate` and `epsilon`.
@@ -58,6 +59,15 @@ fn adam_values(
         param_out[i] = param[i] - m / (f32::sqrt(v) + numbers.epsilon) * numbers.rate;
         moment_1_out[i] = m;
         moment_2_out[i] = v;
+    }
+}
+
+/// What a step of all parameters must move.
+pub(crate) fn floor(sizes: &Sizes) -> Bytes {
+    let values = sizes.gaussians * sizes.parameters;
+    Bytes {
+        read: 16 * values,
+        written: 12 * values,
     }
 }
 

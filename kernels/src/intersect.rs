@@ -17,6 +17,7 @@ use std::fmt;
 
 use cubecl::prelude::*;
 
+use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, per_element};
 use crate::math::is_finite;
 use crate::project::PACKED;
@@ -538,6 +539,14 @@ fn gather(
 ) {
     if ABSOLUTE_POS < instances_listed(counted, at, capacity) as usize {
         out[ABSOLUTE_POS] = table[indices[ABSOLUTE_POS] as usize];
+    }
+}
+
+/// What listing must move for one camera, but for the sorts.
+pub(crate) fn floor(sizes: &Sizes) -> Bytes {
+    Bytes {
+        read: 28 * sizes.gaussians + 64 * sizes.visible + 12 * sizes.instances,
+        written: 8 * sizes.visible + 12 * sizes.instances,
     }
 }
 

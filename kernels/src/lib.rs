@@ -4,7 +4,8 @@
 //! [`project`] and [`sh`] (spherical harmonics) turn Gaussians into screen splats and their colours; [`intersect`]
 //! lists which tiles every splat touches, with [`scan`] and [`sort`]; [`rasterize`] blends each tile front to back;
 //! [`ssim`] and [`adam`] are what else a training step does on every pixel and every parameter; [`blur`] is a window by
-//! itself, [`exp`] our own exponential. [`work`] counts what was launched. Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous,
+//! itself, [`exp`] our own exponential. [`work`] counts what was launched, [`floor`] says what it cannot do without, and
+//! [`copy`] how fast the device's memory is. Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous,
 //! row-major) and launch kernels without waiting, except where they say so. Sums never use float atomics: the same
 //! input gives the same bits on one device.
 
@@ -13,7 +14,10 @@
 
 pub mod adam;
 pub mod blur;
+pub mod copy;
+mod describe;
 pub mod exp;
+pub mod floor;
 pub mod intersect;
 mod launch;
 mod math;
@@ -26,6 +30,7 @@ pub mod sort;
 pub mod ssim;
 mod work;
 
+pub use describe::describe;
 #[doc(hidden)]
 pub use launch::poison;
 pub use launch::{Buffer, CUBE_UNITS};

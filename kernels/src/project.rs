@@ -19,6 +19,7 @@
 
 use cubecl::prelude::*;
 
+use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
 use crate::math::{Mat3, Quat, Vec3, is_finite};
 
@@ -354,6 +355,21 @@ fn project_forward(
             }
         }
     }
+}
+
+/// What forward and gradient of the Gaussians must move for one camera.
+pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
+    let n = sizes.gaussians;
+    [
+        Bytes {
+            read: 40 * n,
+            written: 36 * n,
+        },
+        Bytes {
+            read: 76 * n,
+            written: 40 * n,
+        },
+    ]
 }
 
 /// Projects every Gaussian to every camera: packed splats [C, N, 9] ([`PACKED`]), all zero where culled.

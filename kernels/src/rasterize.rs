@@ -29,6 +29,7 @@ use self::backward::{SHAPE_GRADIENTS, SlotLayout, rasterize_backward, sum_slots}
 use self::forward::rasterize_forward;
 use self::pair::thresholds;
 use self::tile::Plan;
+use crate::floor::{Bytes, Sizes};
 use crate::intersect::{Frames, IntersectError, TileLists, intersect_ahead};
 use crate::launch::{Buffer, cube_count, per_element};
 use crate::math::is_finite;
@@ -183,11 +184,67 @@ fn blend(
     [output, transmittance, walked]
 }
 
+/// What forward and gradient must move for one camera, with lists that are there.
+pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
+    let (i, pixels, color) = (sizes.instances, sizes.pixels(), 4 * sizes.channels);
+    // In the gradient: its sums per instance, written and read again, and what becomes of them per Gaussian.
+    let sums = (24 + color) * i;
+    let packed_and_opacity = 4 * (PACKED as u64 + 1);
+    [
+        Bytes {
+            read: (28 + color) * i,
+            written: (12 + color) * pixels,
+        },
+        Bytes {
+            read: (32 + color) * i + (12 + color) * pixels + sums,
+            written: sums + (packed_and_opacity + color) * sizes.gaussians,
+        },
+    ]
+}
+
+/// Bytes that a forward pass leaves on the device until its gradient is made.
+#[derive(Clone, Copy, Debug)]
+pub struct Kept;
+
+impl Kept {
+    /// Place in the order of depth, and where the slots begin, twice: by splat and by place.
+    pub const PER_SPLAT: u64 = 12;
+    /// Splat and slot, of all instances that there was room for: up to a quarter more than there are.
+    pub const PER_INSTANCE: u64 = 8;
+    /// Where the list begins and ends.
+    pub const PER_TILE: u64 = 8;
+    /// What is left of the light, and how many splats were walked. The image has four bytes per channel and for alpha.
+    pub const PER_PIXEL: u64 = 8;
+
+    /// Bytes per instance that the gradient takes while it is made.
+    pub const fn gradient_per_instance(channels: u64) -> u64 {
+        4 * (SHAPE_GRADIENTS as u64 + channels)
+    }
+}
+
+/// How this device's tiles are dealt out, in words.
+pub fn variant(client: &Client) -> String {
+    let plan = Plan::new(client);
+    let (side, lanes) = (plan.side(), plan.lanes());
+    let owner = match lanes {
+        1 => "one unit each, no planes".to_owned(),
+        lanes => format!("a plane of {lanes} each"),
+    };
+    format!(
+        "{} blocks of {side} x {side} pixels, {owner}; up to {} channels a launch",
+        plan.blocks(),
+        plan.channels()
+    )
+}
+
 /// (Pixel, splat) pairs of a forward pass.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Evaluations {
-    /// Pairs whose alpha was computed.
+    /// Pairs whose alpha was computed for a pixel that was still open: the splats of its tile whose ellipse meets its
+    /// block.
     pub tested: u64,
+    /// Those of them past the alpha cut: blended, or the one that would leave too little light.
+    pub seen: u64,
     /// Those that changed a pixel.
     pub blended: u64,
 }
@@ -203,11 +260,15 @@ pub fn count_evaluations(
     frames: &Frames,
     settings: &RasterizeSettings,
 ) -> Result<Evaluations, String> {
-    let [_, tested, blended] = blend(client, inputs, &state.lists, frames, settings, true);
+    let [output, tested, blended] = blend(client, inputs, &state.lists, frames, settings, true);
+    let output = output.read_f32(client)?;
+    let seen = output.chunks_exact(inputs.channels + 1);
+    let seen = seen.map(|pixel| pixel[inputs.channels] as u64).sum();
     let tested = tested.read_f32(client)?;
     let blended = blended.read_u32(client)?;
     Ok(Evaluations {
         tested: tested.into_iter().map(|count| count as u64).sum(),
+        seen,
         blended: blended.into_iter().map(u64::from).sum(),
     })
 }

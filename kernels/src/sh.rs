@@ -11,6 +11,7 @@
 
 use cubecl::prelude::*;
 
+use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 use crate::math::Vec3;
 
@@ -141,6 +142,22 @@ fn sh_forward(
         }
         Vec3::new(red, green, blue).store(colors, index * 3);
     }
+}
+
+/// What forward and gradient must move for one camera.
+pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
+    let n = sizes.gaussians;
+    let coefficients = 12 * functions(sizes.degree) as u64;
+    [
+        Bytes {
+            read: (12 + coefficients) * n,
+            written: 12 * n,
+        },
+        Bytes {
+            read: (24 + coefficients) * n,
+            written: (12 + coefficients) * n,
+        },
+    ]
 }
 
 /// Colours [C, N, 3] for coefficients [N, `stored`, 3] and directions [C, N, 3] of any length. Coefficients beyond

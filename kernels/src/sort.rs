@@ -9,6 +9,8 @@
 
 use cubecl::prelude::*;
 
+use crate::floor::{Bytes, Sizes};
+use crate::intersect::TILE;
 use crate::launch::{Buffer, cube_count, per_element};
 use crate::planes::plane_size;
 use crate::scan::{cube_exclusive_sum, exclusive_sum};
@@ -30,6 +32,12 @@ struct Ranking {
 }
 
 impl Ranking {
+    fn new(client: &Client) -> Self {
+        Self {
+            lanes: plane_size(client).unwrap_or(1),
+        }
+    }
+
     fn digit_bits(self) -> usize {
         match self.lanes {
             1 => SHARED_DIGIT_BITS,
@@ -247,6 +255,33 @@ fn scatter(
     }
 }
 
+/// Bits by which one pass sorts on the client's device.
+pub fn digit_bits(client: &Client) -> u32 {
+    Ranking::new(client).digit_bits() as u32
+}
+
+/// How this device finds ranks, in words.
+pub fn variant(client: &Client) -> String {
+    let ranking = Ranking::new(client);
+    let ranks = match ranking.lanes {
+        1 => "counters of every unit in shared memory",
+        _ => "ballots",
+    };
+    format!("{} bits a pass, ranks from {ranks}", ranking.digit_bits())
+}
+
+/// What the two sorts of a view must move: the visible splats by depth, then the instances by tile.
+pub(crate) fn floor(sizes: &Sizes) -> Bytes {
+    let tile = u64::from(TILE);
+    let tiles = sizes.width.div_ceil(tile) * sizes.height.div_ceil(tile);
+    let passes = |bits: u32| u64::from(bits.div_ceil(sizes.digit_bits.max(1)));
+    let pairs = sizes.visible * passes(32) + sizes.instances * passes(bits_for(tiles as usize + 1));
+    Bytes {
+        read: 12 * pairs,
+        written: 8 * pairs,
+    }
+}
+
 /// `values[i] = i`.
 #[cube(launch)]
 fn count_up(values: &mut [u32], len: u32) {
@@ -291,9 +326,7 @@ pub(crate) fn sort_first_pairs(
     if most == 0 {
         return (Buffer::empty(client, 0), Buffer::empty(client, 0));
     }
-    let ranking = Ranking {
-        lanes: plane_size(client).unwrap_or(1),
-    };
+    let ranking = Ranking::new(client);
     let digit_bits = ranking.digit_bits() as u32;
     let blocks = most.div_ceil(BLOCK);
     let dim = CubeDim::new_1d(UNITS);

@@ -14,6 +14,7 @@
 
 use cubecl::prelude::*;
 
+use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 
 /// Values along the window's axis that one unit makes.
@@ -410,6 +411,21 @@ fn gradient_down_columns(
             }
         }
     }
+}
+
+/// What forward and gradient of one of the images must move.
+pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
+    let values = sizes.pixels() * sizes.channels;
+    [
+        Bytes {
+            read: 8 * values,
+            written: 20 * values,
+        },
+        Bytes {
+            read: 28 * values,
+            written: 4 * values,
+        },
+    ]
 }
 
 /// S of every value of `images` (x, y, both [B, H, W, D]), and mx, my, q, p [4, B, H, W, D] for the gradient.

@@ -32,6 +32,7 @@ mod composed;
 pub mod cpu;
 #[cfg(feature = "cube")]
 mod cube;
+pub mod device;
 mod error;
 mod photometric;
 mod project;
@@ -47,7 +48,9 @@ pub use activation::{Activation, exp, sigmoid};
 pub use adam::{AdamRows, AdamStep, adam_step};
 pub use blur::gaussian_blur;
 #[cfg(feature = "cpu")]
-pub use cpu::{RasterizeWork, rasterize_work};
+pub use cpu::RasterizeWork;
+#[cfg(feature = "cpu")]
+pub use device::rasterize_work;
 pub use error::{ErrorSlot, OpError};
 pub use photometric::{Photometric, Target, photometric};
 pub use project::{Projected, project};

@@ -254,6 +254,47 @@ fn benches_of_speed_leave_their_figures() {
 }
 
 #[test]
+#[cfg(feature = "wgpu")]
+fn benches_of_speed_measure_a_device_too() {
+    let folder = TempDir::new().unwrap();
+    let json = folder.path().join("figures.json");
+    let figures = |arguments: &[&str]| -> Option<serde_json::Value> {
+        let output = Command::new(env!("CARGO_BIN_EXE_splat"))
+            .args(["--device", "wgpu", "--quiet", "bench"])
+            .args(arguments)
+            .args(["--json", text(&json)])
+            .output()
+            .unwrap();
+        if String::from_utf8_lossy(&output.stderr).contains("no adapter can be used") {
+            eprintln!("\n*** SKIPPED: no wgpu adapter here ***\n");
+            return None;
+        }
+        succeed(&output);
+        Some(serde_json::from_slice(&fs::read(&json).unwrap()).unwrap())
+    };
+    let capture = example(folder.path());
+    let small = ["--downscale", "16", "--seconds", "0"];
+    let Some(rasterize) = figures(&[&["rasterize", text(&capture)], &small[..]].concat()) else {
+        return;
+    };
+    let row = &rasterize["rows"][0];
+    let median = |name: &str| row[name]["median"].as_f64().unwrap();
+    assert!(median("render_forward_milliseconds") > 0.0);
+    assert!(median("render_backward_milliseconds") > 0.0);
+    assert!(row["forward"]["tested_per_second"].as_f64().unwrap() > 0.0);
+    let facts = rasterize["device"].as_array().unwrap();
+    assert!(facts.iter().any(|fact| fact[0] == "planes"), "{facts:?}");
+
+    let scaling = figures(&["scaling", "--gaussians", "300", "--pixels", "64x36"]).unwrap();
+    let point = &scaling["points"][0];
+    assert_eq!(point["work"]["pixels"], 64.0 * 36.0);
+    let memory = &point["device_memory"];
+    let bytes = |name: &str| memory[name].as_u64().unwrap();
+    assert!(bytes("at_rest_bytes") >= 300 * 716, "{memory}");
+    assert!(bytes("most_bytes") > bytes("at_rest_bytes"));
+}
+
+#[test]
 fn benches_refuse_what_they_cannot_measure_in_one_line() {
     let folder = TempDir::new().unwrap();
     let nowhere = folder.path().join("nowhere");
@@ -262,7 +303,7 @@ fn benches_refuse_what_they_cannot_measure_in_one_line() {
         (&["rasterize", "a.ply"], "--capture"),
         (&["step", text(&nowhere), "--downscale", "0"], "downscale"),
         (&["scaling", "--gaussians", "10,0"], "--gaussians"),
-        (&["scaling", "--device", "wgpu"], "--device"),
+        (&["performance", "--device", "wgpu"], "--device"),
     ];
     for (arguments, named) in bad {
         let output = Command::new(env!("CARGO_BIN_EXE_splat"))

@@ -11,7 +11,8 @@ use super::tile::{BATCH, Batch, Plan, WORDS, pixel_index, place};
 use crate::intersect::Grid;
 
 /// One workgroup per tile; `width` channels from `first_channel` on. Counting: instead of what is left of the light and
-/// of the splats walked, every pixel writes how many splats were tested for it and how many it blended.
+/// of the splats walked, every pixel writes how many splats were tested for it and how many it blended, and as its alpha
+/// how many were past the alpha cut.
 #[cube(launch)]
 pub(super) fn rasterize_forward(
     packed: &[f32],
@@ -65,6 +66,7 @@ pub(super) fn rasterize_forward(
     let mut open = Array::<u32>::new(pixels);
     let mut sums = Array::<f32>::new(comptime!(pixels * width));
     let mut tested = Array::<u32>::new(pixels);
+    let mut cut = Array::<u32>::new(pixels);
     let mut open_pixels = 0u32;
     #[unroll]
     for q in 0..pixels {
@@ -73,6 +75,7 @@ pub(super) fn rasterize_forward(
         t[q] = 1.0f32;
         last[q] = 0u32;
         tested[q] = 0u32;
+        cut[q] = 0u32;
         open[q] = select(inside, 1u32, 0u32);
         open_pixels += open[q];
         #[unroll]
@@ -132,6 +135,7 @@ pub(super) fn rasterize_forward(
                     let blended = select(seen, left, 0u32);
                     if comptime!(counting) {
                         tested[q] += open[q];
+                        cut[q] += select(seen, 1u32, 0u32);
                     }
                     open[q] = select(seen, left, open[q]);
                     let blends = blended == 1u32;
@@ -176,7 +180,11 @@ pub(super) fn rasterize_forward(
                 output[out + channel] = sum;
             }
             if comptime!(first_launch) {
-                output[out + channels as usize] = 1.0f32 - t[q];
+                output[out + channels as usize] = if comptime!(counting) {
+                    cut[q] as f32
+                } else {
+                    1.0f32 - t[q]
+                };
                 transmittance[pixel] = if comptime!(counting) {
                     tested[q] as f32
                 } else {

@@ -414,7 +414,7 @@ fn more_tiles_than_one_dimension_of_workgroups_can_hold() {
 #[test]
 fn evaluations_are_counted() {
     let Some(client) = client() else { return };
-    let scene = Scene::new(1, 90, 50, 35, 1, [0.3, 0.98], 44);
+    let scene = Scene::new(1, 400, 50, 35, 1, [0.5, 0.98], 44);
     let inputs = scene.inputs(&client);
     let (_, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
     let count = count_evaluations(&client, &inputs, &state, &scene.frames, &SETTINGS).unwrap();
@@ -422,7 +422,7 @@ fn evaluations_are_counted() {
     let [packed, _, opacities, _] = scene.wide();
     let mut order: Vec<usize> = (0..scene.frames.gaussians).collect();
     order.sort_by(|&a, &b| packed[a * 9 + 2].total_cmp(&packed[b * 9 + 2]));
-    let (mut blended, mut until_stop) = (0, 0);
+    let (mut blended, mut stopped, mut until_stop) = (0, 0, 0);
     for pixel in 0..50 * 35 {
         let (x, y) = ((pixel % 50) as f64 + 0.5, (pixel / 50) as f64 + 0.5);
         let mut t = 1.0;
@@ -434,6 +434,7 @@ fn evaluations_are_counted() {
             }
             let next = t * (1.0 - raw.min(0.99));
             if next < 9.999e-5 {
+                stopped += 1;
                 break;
             }
             t = next;
@@ -442,6 +443,9 @@ fn evaluations_are_counted() {
     }
     println!("{count:?}; {until_stop} without any lists");
     assert_eq!(count.blended, blended);
+    // A pixel sees what it blends, and the splat before which it stops.
+    assert!(stopped > 0, "no pixel stops");
+    assert_eq!(count.seen, blended + stopped);
     assert!(count.tested > count.blended && count.tested < until_stop / 2);
 }
 

@@ -13,6 +13,9 @@ mod ssim;
 #[cfg(all(test, feature = "cpu", feature = "wgpu"))]
 pub(crate) mod tests;
 
+#[cfg(feature = "cpu")]
+pub(crate) use rasterize::work as rasterize_work;
+
 use burn::backend::TensorMetadata;
 use burn::tensor::{DType, Shape};
 use burn_cubecl::CubeBackend;
@@ -149,7 +152,9 @@ impl SplatBackend for CubeBackend {
         let _span = trace_span!("blur").entered();
         blur::blur(image, window)
     }
+
     fn ssim_forward(images: [CubeTensor; 2], args: &SsimArgs) -> (CubeTensor, Vec<CubeTensor>) {
+        let _span = trace_span!("ssim").entered();
         ssim::forward(images, args)
     }
 
@@ -160,10 +165,12 @@ impl SplatBackend for CubeBackend {
         args: &SsimArgs,
         wanted: [bool; 2],
     ) -> [Option<CubeTensor>; 2] {
+        let _span = trace_span!("ssim gradient").entered();
         ssim::backward(images, moments, grad, args, wanted)
     }
 
     fn adam(tensors: [CubeTensor; 4], step: &AdamStep) -> [CubeTensor; 3] {
+        let _span = trace_span!("adam").entered();
         adam::step(tensors, step)
     }
 }

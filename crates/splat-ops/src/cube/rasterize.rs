@@ -8,7 +8,7 @@ use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::Buffer;
 use splat_kernels::intersect::{Frames, IntersectError, MAX_INSTANCES};
 use splat_kernels::rasterize::{
-    RasterizeInputs, RasterizeSettings, RasterizeState, rasterize, rasterize_vjp,
+    RasterizeInputs, RasterizeSettings, RasterizeState, count_evaluations, rasterize, rasterize_vjp,
 };
 
 use super::{buffer, prepare, tensor};
@@ -154,4 +154,49 @@ pub(super) fn backward(
             .as_ref()
             .and_then(|input| like(background, input)),
     ]
+}
+
+/// The evaluations of a forward pass, counted on the device of `client`. Through the host: packed splats, colours
+/// `[C, N, D]` and opacities `[C, N]` are measured once, not often.
+#[cfg(feature = "cpu")]
+pub(crate) fn work(
+    client: &cubecl::client::Client,
+    projected: &crate::Projected,
+    colors: burn::tensor::Tensor<3>,
+    opacities: burn::tensor::Tensor<2>,
+    settings: &crate::RasterizeSettings,
+) -> Result<crate::RasterizeWork, OpError> {
+    let [cameras, gaussians, channels] = colors.dims();
+    let upload = |data: burn::tensor::TensorData| {
+        let values = data.convert::<f32>().try_into_vec::<f32>();
+        Buffer::from_f32(client, &values.unwrap_or_default())
+    };
+    let inputs = RasterizeInputs {
+        packed: upload(projected.packed().into_data()),
+        colors: upload(colors.into_data()),
+        opacities: upload(opacities.into_data()),
+        background: None,
+        channels,
+    };
+    let size = projected.image_size();
+    let frames = Frames {
+        cameras,
+        gaussians,
+        width: size.width,
+        height: size.height,
+        alpha_min: settings.alpha_min as f32,
+    };
+    let thresholds = RasterizeSettings {
+        alpha_max: settings.alpha_max as f32,
+        transmittance_min: settings.transmittance_min as f32,
+    };
+    let (_, state) = rasterize(client, &inputs, &frames, &thresholds).map_err(op_error)?;
+    let count = count_evaluations(client, &inputs, &state, &frames, &thresholds);
+    let count = count.map_err(|what| op_error(IntersectError::Device(what)))?;
+    Ok(crate::RasterizeWork {
+        instances: state.lists.instances as u64,
+        tested: count.tested,
+        seen: count.seen,
+        blended: count.blended,
+    })
 }

@@ -2,6 +2,7 @@
 
 use burn::tensor::Device;
 use clap::ValueEnum;
+use splat_ops::device::describe;
 
 use super::{Failure, GlobalArgs};
 
@@ -19,10 +20,34 @@ pub enum DeviceChoice {
     Cuda,
 }
 
+impl DeviceChoice {
+    /// As it is typed.
+    #[cfg(feature = "cpu")]
+    pub(super) fn argument(self) -> &'static str {
+        match self {
+            Self::Auto => "auto",
+            Self::Cpu => "cpu",
+            Self::Wgpu => "wgpu",
+            Self::Cuda => "cuda",
+        }
+    }
+}
+
 /// A device and its name, for the user and for `metrics.json`.
 pub(super) struct ChosenDevice {
     pub device: Device,
     pub name: String,
+}
+
+impl ChosenDevice {
+    /// Its name, and of a CubeCL device what decides which variants of the kernels run, and which these are.
+    fn in_words(&self) -> String {
+        let facts = describe(&self.device).unwrap_or_default();
+        let told = ["runtime", "planes", "atomic addition", "rasterize", "sort"];
+        let facts = facts.iter().filter(|(name, _)| told.contains(name));
+        let facts = facts.map(|(name, value)| format!("; {name}: {value}"));
+        self.name.clone() + &facts.collect::<String>()
+    }
 }
 
 /// Opens the device the user chose and says in a line which it is.
@@ -35,7 +60,7 @@ pub(super) fn open(global: &GlobalArgs) -> Result<ChosenDevice, Failure> {
             .or_else(|_| real_gpu().ok_or(()))
             .or_else(|()| cpu().or_else(|_| wgpu())),
     }?;
-    global.say(format_args!("device: {}", chosen.name));
+    global.say(format_args!("device: {}", chosen.in_words()));
     Ok(chosen)
 }
 

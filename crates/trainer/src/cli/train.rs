@@ -261,6 +261,10 @@ fn finish(
         seconds: seconds(trained.elapsed),
         seconds_per_step: seconds(trained.elapsed) / trained.steps as f64,
         peak_rss_bytes: peak_rss_bytes(),
+        device_bytes: chosen
+            .device
+            .memory_pool_usage()
+            .map(|usage| usage.bytes_reserved),
         device: chosen.name.clone(),
         seed: config.seed,
     };

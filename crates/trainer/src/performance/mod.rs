@@ -1,8 +1,11 @@
-//! How fast it is on the CPU, what the time goes to, and how that grows: `splat bench step|rasterize|scaling`.
+//! How fast it is, what the time goes to, and how that grows: `splat bench step|rasterize|scaling`, on the CPU or on a
+//! CubeCL device.
 //!
 //! Nothing here is a copy of what it measures: steps are those of the [`Trainer`](crate::Trainer), and their stages are
 //! the `tracing` spans in it and in the ops.
 
+mod device_memory;
+pub mod device_step;
 mod machine;
 pub mod page;
 pub mod rasterize;
@@ -14,11 +17,13 @@ mod step_plot;
 mod threads;
 mod work;
 
+pub use device_memory::{DeviceMemory, PER_GAUSSIAN_AT_REST};
 pub use machine::Machine;
 pub use spread::Spread;
 pub use threads::{all_threads, on_threads};
 pub use work::Work;
 
+use burn::backend::ExecutionError;
 use splat_ops::OpError;
 
 use crate::TrainError;
@@ -35,13 +40,19 @@ pub enum PerformanceError {
     /// Threads could not be started.
     #[error("threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
+    /// A device stopped working.
+    #[error("the device: {0}")]
+    Device(#[from] ExecutionError),
+    /// A figure of CubeCL devices was asked of another.
+    #[error("the device is none of CubeCL's; choose one with --device wgpu or --device cuda")]
+    NotCubeCl,
     /// The process that measures a point of the scaling did not.
-    #[error("{gaussians} Gaussians, {pixels} pixels: {reason}")]
+    #[error("{gaussians} Gaussians, {size} pixels: {reason}")]
     Point {
         /// Gaussians of the point.
         gaussians: usize,
-        /// Pixels of the point.
-        pixels: usize,
+        /// Its photos.
+        size: scaling::PhotoSize,
         /// What went wrong.
         reason: String,
     },

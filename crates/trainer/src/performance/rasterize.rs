@@ -1,4 +1,5 @@
-//! The rasteriser: (pixel, Gaussian) evaluations per second and core, on the lists of a real scene.
+//! The rasteriser: (pixel, Gaussian) evaluations per second and core (or per CubeCL device), on the lists of a real
+//! scene.
 
 use std::fmt::Write;
 use std::time::{Duration, Instant};
@@ -8,7 +9,9 @@ use serde::Serialize;
 use splat_model::files::SplatData;
 use splat_model::{Gaussians, RenderSettings, render};
 use splat_ops::cpu::InstructionSet;
+use splat_ops::device::describe;
 
+use super::device_step::write_device;
 use super::stages::{Recording, Stage};
 use super::work::sample;
 use super::{Machine, PerformanceError, Spread, Work, all_threads, on_threads};
@@ -69,11 +72,13 @@ fn limit(instructions: InstructionSet) -> Limit {
 pub struct RasterizeReport {
     /// Where and when.
     pub machine: Machine,
+    /// What is known of the CubeCL device that rendered; absent where it was the CPU.
+    pub device: Option<Vec<(&'static str, String)>>,
     /// What was rendered.
     pub scene: String,
     /// The work of a view.
     pub work: Work,
-    /// One per number of threads.
+    /// One per number of threads; one of one thread for a device.
     pub rows: Vec<RasterizeRow>,
 }
 
@@ -90,6 +95,11 @@ pub struct RasterizeRow {
     pub forward: Rate,
     /// Its gradient.
     pub backward: Rate,
+    /// Milliseconds per view of projection, colours and rasteriser together, and of their gradients; of a CubeCL device
+    /// only, idle before and after.
+    pub render_forward_milliseconds: Option<Spread>,
+    /// See above.
+    pub render_backward_milliseconds: Option<Spread>,
 }
 
 /// How fast the evaluations of a view are done. Both directions count those of the forward pass.
@@ -115,7 +125,8 @@ impl Rate {
     }
 }
 
-/// Measures the rasteriser on up to eight of `views`, on one thread and on all; `seconds` bounds the time of each.
+/// Measures the rasteriser of `device` on up to eight of `views`, that of the CPU on one thread and on all; `seconds`
+/// bounds the time of each. A CubeCL device is waited for where the rasteriser begins and ends.
 ///
 /// # Errors
 /// When the scene cannot be rendered.
@@ -124,25 +135,30 @@ pub fn measure(
     data: &SplatData,
     views: &[&View],
     settings: &RenderSettings,
+    device: &Device,
     seconds: f64,
     mut say: impl FnMut(&str),
 ) -> Result<RasterizeReport, PerformanceError> {
     let views = sample(views, VIEWS);
     say("counting the work");
-    let device = Device::flex();
     let work = Work::count(
-        &Gaussians::from_data(data, &device),
+        &Gaussians::from_data(data, device),
         &views,
         settings,
-        &device,
+        device,
     )?;
+    let facts = describe(device);
     let mut rows = vec![];
-    for threads in all_threads() {
+    let threads = match facts {
+        Some(_) => vec![1],
+        None => all_threads(),
+    };
+    for threads in threads {
         say(&format!(
             "rasterising {} views on {threads} thread(s)",
             views.len()
         ));
-        let passes = on_threads(threads, || passes(data, &views, settings, seconds))?;
+        let passes = on_threads(threads, || passes(data, &views, settings, device, seconds))?;
         let per_view = |pass: &Pass, time: fn(&Pass) -> Duration| {
             1e3 * time(pass).as_secs_f64() / views.len() as f64
         };
@@ -155,22 +171,31 @@ pub fn measure(
             lists: apart.then(|| Spread::of(times(|pass| pass.lists))),
             forward: Rate::new(times(|pass| pass.forward), &work, threads),
             backward: Rate::new(times(|pass| pass.backward), &work, threads),
+            render_forward_milliseconds: facts
+                .is_some()
+                .then(|| Spread::of(times(|pass| pass.render_forward))),
+            render_backward_milliseconds: facts
+                .is_some()
+                .then(|| Spread::of(times(|pass| pass.render_backward))),
         });
     }
     Ok(RasterizeReport {
         machine: Machine::here(),
+        device: facts,
         scene: scene.to_owned(),
         work,
         rows,
     })
 }
 
-/// Time of the rasteriser's spans, over all views.
+/// Time of the rasteriser's spans over all views, and of the whole render on a CubeCL device.
 #[derive(Default)]
 struct Pass {
     lists: Duration,
     forward: Duration,
     backward: Duration,
+    render_forward: Duration,
+    render_backward: Duration,
 }
 
 impl Pass {
@@ -186,14 +211,17 @@ impl Pass {
     }
 }
 
-/// Renders the views and goes back through them, again and again.
+/// Renders the views and goes back through them, again and again; a CubeCL device twice, waited for by stages and as a
+/// whole.
 fn passes(
     data: &SplatData,
     views: &[&View],
     settings: &RenderSettings,
+    device: &Device,
     seconds: f64,
 ) -> Result<Vec<Pass>, PerformanceError> {
-    let device = Device::flex().autodiff();
+    let waited_for = describe(device).is_some().then(|| device.clone());
+    let device = device.clone().autodiff();
     let gaussians = Gaussians::from_data(data, &device);
     let inputs: Vec<_> = views
         .iter()
@@ -202,7 +230,7 @@ fn passes(
             (camera.tensors(&device), photo(view, &device))
         })
         .collect();
-    Recording::of(|recording| {
+    let record = |recording: &Recording| {
         let mut passes = vec![];
         let start = Instant::now();
         for number in 0..WARM_UP + PASSES {
@@ -221,7 +249,28 @@ fn passes(
             }
         }
         Ok(passes)
-    })
+    };
+    let Some(device) = waited_for else {
+        return Recording::of(record);
+    };
+    let mut passes: Vec<Pass> = Recording::on_device(&device, record)?;
+    // Nobody listens now, so that within these the device is not waited for.
+    for pass in &mut passes {
+        for (cameras, photo) in &inputs {
+            device.sync()?;
+            let start = Instant::now();
+            let rendered = render(&gaussians, cameras, settings)?;
+            device.sync()?;
+            pass.render_forward += start.elapsed();
+            let loss = (rendered.image() - photo.clone()).square().mean();
+            device.sync()?;
+            let start = Instant::now();
+            loss.backward();
+            device.sync()?;
+            pass.render_backward += start.elapsed();
+        }
+    }
+    Ok(passes)
 }
 
 impl RasterizeReport {
@@ -233,9 +282,57 @@ impl RasterizeReport {
         text
     }
 
+    fn write_device(
+        &self,
+        text: &mut String,
+        facts: &[(&'static str, String)],
+    ) -> std::fmt::Result {
+        write_device(text, facts)?;
+        writeln!(
+            text,
+            "\nTime per view, the device waited for before and after, and 1e9 pairs per second. Forward includes making the \
+             lists. A pair is tested where a block of the tile, whose pixels walk together, meets the ellipse.\n"
+        )?;
+        writeln!(
+            text,
+            "| direction | median ms | min | max | tested | blended |"
+        )?;
+        writeln!(text, "|---|{}", "--:|".repeat(5))?;
+        for row in &self.rows {
+            for (direction, rate) in [("forward", row.forward), ("backward", row.backward)] {
+                let Spread { median, min, max } = rate.milliseconds;
+                writeln!(
+                    text,
+                    "| {direction} | {median:.2} | {min:.2} | {max:.2} | {:.3} | {:.3} |",
+                    1e-9 * rate.tested_per_second,
+                    1e-9 * rate.blended_per_second
+                )?;
+            }
+            let whole = [
+                (
+                    "projection, colours and forward",
+                    row.render_forward_milliseconds,
+                ),
+                ("all of backward", row.render_backward_milliseconds),
+            ];
+            for (direction, milliseconds) in whole {
+                if let Some(Spread { median, min, max }) = milliseconds {
+                    writeln!(
+                        text,
+                        "| {direction} | {median:.2} | {min:.2} | {max:.2} | | |"
+                    )?;
+                }
+            }
+        }
+        Ok(())
+    }
+
     fn write(&self, text: &mut String) -> std::fmt::Result {
         writeln!(text, "Scene: {}.\n", self.scene)?;
         writeln!(text, "{}", self.work.markdown())?;
+        if let Some(facts) = &self.device {
+            return self.write_device(text, facts);
+        }
         let limit = limit(InstructionSet::chosen());
         writeln!(
             text,

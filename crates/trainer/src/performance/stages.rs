@@ -3,6 +3,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use burn::tensor::Device;
 use tracing::span::Id;
 use tracing::subscriber::with_default;
 use tracing::{Subscriber, span};
@@ -22,12 +23,17 @@ pub struct Stage {
 
 /// Spans that have ended since it was last taken, in the order in which their names first did.
 #[derive(Debug, Clone, Default)]
-pub struct Recording(Arc<Mutex<Spans>>);
+pub struct Recording {
+    spans: Arc<Mutex<Spans>>,
+    /// Waited for where a span begins or ends.
+    device: Option<Device>,
+}
 
 #[derive(Debug, Default)]
 struct Spans {
     open: Vec<Open>,
     stages: Vec<Stage>,
+    most_in_use: u64,
 }
 
 #[derive(Debug)]
@@ -46,19 +52,47 @@ impl Recording {
         with_default(subscriber, || work(&recording))
     }
 
+    /// The same, where `work` is done by a device that goes on while the host does: each span begins and ends when the
+    /// device has nothing left to do. What else runs side by side is lost to the whole.
+    pub fn on_device<R>(device: &Device, work: impl FnOnce(&Self) -> R) -> R {
+        let recording = Self {
+            device: Some(device.clone()),
+            ..Self::default()
+        };
+        let subscriber = Registry::default().with(recording.clone());
+        with_default(subscriber, || work(&recording))
+    }
+
+    /// The most bytes in use where a span began or ended, by the device's own count; zero without a device that counts.
+    pub fn most_in_use(&self) -> u64 {
+        self.spans().most_in_use
+    }
+
+    /// Until the device has done what it was given.
+    fn settle(&self) {
+        let Some(device) = &self.device else { return };
+        // A device that fails says so again to whoever asks it for a result.
+        let _ = device.sync();
+        if let Some(usage) = device.memory_pool_usage() {
+            let mut spans = self.spans();
+            spans.most_in_use = spans.most_in_use.max(usage.bytes_in_use);
+        }
+    }
+
     /// What was recorded; begins anew.
     pub fn take(&self) -> Vec<Stage> {
         core::mem::take(&mut self.spans().stages)
     }
 
     fn spans(&self) -> std::sync::MutexGuard<'_, Spans> {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+        self.spans.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Recording {
     fn on_enter(&self, id: &span::Id, context: Context<'_, S>) {
         let name = context.metadata(id).map_or("", |metadata| metadata.name());
+        self.settle();
         self.spans().open.push(Open {
             name,
             start: Instant::now(),
@@ -67,6 +101,7 @@ impl<S: Subscriber + for<'a> LookupSpan<'a>> Layer<S> for Recording {
     }
 
     fn on_exit(&self, _: &Id, _: Context<'_, S>) {
+        self.settle();
         let mut spans = self.spans();
         let Some(open) = spans.open.pop() else {
             return;

@@ -1,4 +1,4 @@
-//! A training step: its time, on one thread and on all, and what the time goes to.
+//! A training step on the CPU: its time, on one thread and on all, and what the time goes to.
 
 use std::fmt::Write;
 use std::sync::Arc;
@@ -115,20 +115,32 @@ pub(super) fn at_degree(config: &TrainConfig, sh_degree: usize) -> TrainConfig {
     }
 }
 
-/// The work of the first Gaussians of a capture.
+/// The work of the first Gaussians of a capture on the CPU.
 pub(super) fn work(capture: &Arc<Capture>, config: &TrainConfig) -> Result<Work, PerformanceError> {
-    let device = Device::flex();
-    let gaussians = trainer(capture, config)?.gaussians().valid();
-    let views: Vec<&View> = capture.train_views().collect();
-    let settings = config.render_settings(0);
-    Work::count(&gaussians, &sample(&views, VIEWS), &settings, &device)
+    work_on(capture, config, &Device::flex())
 }
 
-fn trainer(capture: &Arc<Capture>, config: &TrainConfig) -> Result<Trainer, PerformanceError> {
+/// The work of the first Gaussians of a capture, as the ops of `device` do it.
+pub(super) fn work_on(
+    capture: &Arc<Capture>,
+    config: &TrainConfig,
+    device: &Device,
+) -> Result<Work, PerformanceError> {
+    let gaussians = trainer(capture, config, device)?.gaussians().valid();
+    let views: Vec<&View> = capture.train_views().collect();
+    let settings = config.render_settings(0);
+    Work::count(&gaussians, &sample(&views, VIEWS), &settings, device)
+}
+
+pub(super) fn trainer(
+    capture: &Arc<Capture>,
+    config: &TrainConfig,
+    device: &Device,
+) -> Result<Trainer, PerformanceError> {
     Ok(Trainer::builder()
         .capture(capture.clone())
         .config(config.clone())
-        .device(Device::flex())
+        .device(device.clone())
         .build()?)
 }
 
@@ -210,7 +222,7 @@ pub(super) fn run(
     warm_up: usize,
     steps: usize,
 ) -> Result<Samples, PerformanceError> {
-    let mut trainer = trainer(capture, config)?;
+    let mut trainer = trainer(capture, config, &Device::flex())?;
     for _ in 0..warm_up {
         trainer.step()?;
     }

@@ -99,7 +99,7 @@ mod tests {
     use splat_model::splats_from_points;
 
     use super::*;
-    use crate::performance::scaling::synthetic_capture;
+    use crate::performance::scaling::{PhotoSize, synthetic_capture};
 
     /// Pairs past the cut and pairs blended, from the definition: every splat at every pixel, in double precision.
     fn by_hand(projected: Vec<f32>, opacities: Vec<f32>, [width, height]: [u32; 2]) -> [f64; 2] {
@@ -138,7 +138,7 @@ mod tests {
     #[test]
     fn counts_are_those_of_the_definition() {
         // 64 x 48: whole tiles, so that nothing is evaluated beyond the edges.
-        let capture = synthetic_capture(400, 3072);
+        let capture = synthetic_capture(400, PhotoSize::of_pixels(3072));
         let positions: Vec<_> = capture
             .points
             .iter()

@@ -24,6 +24,8 @@ pub struct Metrics {
     pub seconds_per_step: f64,
     /// Most memory that was resident, `null` where the system does not say ([`super::memory::peak_rss_bytes`]).
     pub peak_rss_bytes: Option<u64>,
+    /// Memory that a CubeCL device's allocator held at the end, what it keeps for reuse included; `null` elsewhere.
+    pub device_bytes: Option<u64>,
     /// What was computed on.
     pub device: String,
     /// Seed of the run.
@@ -63,12 +65,13 @@ mod tests {
             seconds: 5.0,
             seconds_per_step: 0.5,
             peak_rss_bytes: None,
+            device_bytes: None,
             device: "cpu".into(),
             seed: 7,
         };
         assert_eq!(
             serde_json::to_string(&metrics).unwrap(),
-            r#"{"psnr":21.5,"ssim":0.625,"views":[{"name":"a","psnr":20.0,"ssim":0.5},{"name":"b","psnr":23.0,"ssim":0.75}],"gaussians":3,"steps":10,"seconds":5.0,"seconds_per_step":0.5,"peak_rss_bytes":null,"device":"cpu","seed":7}"#
+            r#"{"psnr":21.5,"ssim":0.625,"views":[{"name":"a","psnr":20.0,"ssim":0.5},{"name":"b","psnr":23.0,"ssim":0.75}],"gaussians":3,"steps":10,"seconds":5.0,"seconds_per_step":0.5,"peak_rss_bytes":null,"device_bytes":null,"device":"cpu","seed":7}"#
         );
         let none = serde_json::to_string(&Scores::of_views(vec![])).unwrap();
         assert_eq!(none, r#"{"psnr":null,"ssim":null,"views":[]}"#);

@@ -1,4 +1,4 @@
-//! How much work an image takes.
+//! How much work an image takes on the CPU.
 
 use burn::tensor::Tensor;
 use rayon::prelude::*;
@@ -11,20 +11,20 @@ use crate::rasterize::per_camera;
 use crate::settings::RasterizeArgs;
 use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
 
-/// What [`rasterize`](crate::rasterize) does on the CPU, in numbers.
+/// What [`rasterize`](crate::rasterize) does, in numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RasterizeWork {
     /// Pairs of a tile and a splat that is listed in it.
     pub instances: u64,
     /// Pairs of a pixel and a splat whose alpha the forward pass evaluates. The backward pass evaluates about as many.
     pub tested: u64,
-    /// Those of them whose alpha reaches `alpha_min`; beyond the image's edges too, in the tiles that lie across.
+    /// Those of them whose alpha reaches `alpha_min`; on the CPU beyond the image's edges too, in the tiles that lie across.
     pub seen: u64,
     /// Those of them that are blended: the pixel exists and had not stopped.
     pub blended: u64,
 }
 
-/// Counts the work of [`rasterize`](crate::rasterize) with the same arguments, by doing it.
+/// Counts the work of [`rasterize`](crate::rasterize) with the same arguments, by doing it on the CPU, wherever they are.
 ///
 /// # Errors
 /// As [`rasterize`](crate::rasterize).

@@ -1,4 +1,4 @@
-//! `splat bench`: errors, speed and how it grows.
+//! `splat bench`: errors, speed and how it grows, on the CPU or a CubeCL device.
 
 mod accuracy;
 mod input;
@@ -9,6 +9,7 @@ mod step;
 
 use std::path::Path;
 
+use burn::tensor::Device;
 use clap::{Args, Subcommand};
 
 use super::{DeviceChoice, Failure, GlobalArgs, device, print};
@@ -19,6 +20,7 @@ use crate::report::{ReportError, write_atomically};
 #[command(after_help = "Examples:
   splat bench accuracy --report docs
   splat bench step photos/ --downscale 2
+  splat bench step photos/ --downscale 2 --device wgpu
   splat bench performance --report docs")]
 pub struct BenchArgs {
     #[command(subcommand)]
@@ -62,12 +64,21 @@ fn write_svg(path: &Path, svg: Result<String, String>) -> Result<(), Failure> {
     Ok(written.map_err(|source| ReportError::Io { path, source })?)
 }
 
-/// The benches of speed measure the CPU path: another device is not what the user would get figures for.
+/// What the benches of speed measure on: the CPU unless another device is asked for by name.
+fn chosen(global: &GlobalArgs) -> Result<Device, Failure> {
+    match global.device {
+        DeviceChoice::Auto | DeviceChoice::Cpu => Ok(Device::flex()),
+        DeviceChoice::Wgpu | DeviceChoice::Cuda => Ok(device::open(global)?.device),
+    }
+}
+
+/// The page of all benches of speed is about the CPU: another device is not what the user would get figures for.
 fn cpu_only(global: &GlobalArgs) -> Result<(), Failure> {
     match global.device {
         DeviceChoice::Auto | DeviceChoice::Cpu => Ok(()),
         DeviceChoice::Wgpu | DeviceChoice::Cuda => Err(Failure::BadInput(
-            "--device: this bench measures the CPU path alone".to_owned(),
+            "--device: this page is about the CPU; step, rasterize and scaling take a device each"
+                .to_owned(),
         )),
     }
 }

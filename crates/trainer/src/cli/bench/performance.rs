@@ -7,7 +7,7 @@ use clap::Args;
 use super::input::{CaptureArgs, EXAMPLE};
 use super::{Failure, GlobalArgs, cpu_only, print, rasterize, scaling, write, write_svg};
 use crate::performance::page::PerformanceReport;
-use crate::performance::scaling::{GAUSSIANS, PIXELS};
+use crate::performance::scaling::{GAUSSIANS, PIXELS, PhotoSize};
 use crate::performance::step;
 use crate::report::metrics::write_json;
 
@@ -42,7 +42,7 @@ pub(super) fn run(args: &PerformanceArgs, global: &GlobalArgs) -> Result<(), Fai
     let report = PerformanceReport {
         step: step::measure(&capture, &config, args.input.seconds, say)?,
         rasterize: rasterize::report(args.scene.as_deref(), folder, &args.input, global)?,
-        scaling: scaling::report(&GAUSSIANS, &PIXELS, global)?,
+        scaling: scaling::report(&GAUSSIANS, &PIXELS.map(PhotoSize::of_pixels), global)?,
     };
     let text = page(args, &report);
     print(&text);

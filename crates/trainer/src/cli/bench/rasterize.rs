@@ -3,23 +3,25 @@
 use std::path::{Path, PathBuf};
 
 use burn::module::Module;
-use burn::tensor::Device;
 use clap::Args;
 
 use super::input::{CaptureArgs, EXAMPLE};
-use super::{Failure, GlobalArgs, cpu_only, print};
+use super::{Failure, GlobalArgs, chosen, print};
 use crate::capture::View;
 use crate::cli::scene;
 use crate::performance::rasterize::{RasterizeReport, measure};
 use crate::report::metrics::write_json;
 use crate::train::Trainer;
 
-/// The rasteriser on the CPU: evaluations per second and core, on the lists of a real scene
+/// The rasteriser: evaluations per second, on the CPU per core, on the lists of a real scene
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   splat bench rasterize
   splat bench rasterize photos/ --downscale 2
-  splat bench rasterize out/garden/scene.ply --capture photos/ --downscale 2")]
+  splat bench rasterize out/garden/scene.ply --capture photos/ --downscale 2
+  splat bench rasterize photos/ --device wgpu
+
+Measures the CPU unless --device names another.")]
 pub(super) struct RasterizeArgs {
     /// Capture, whose first Gaussians are rendered, or a scene.ply [default: examples/data/saharov]
     scene: Option<PathBuf>,
@@ -35,7 +37,6 @@ pub(super) struct RasterizeArgs {
 
 /// Runs the command.
 pub(super) fn run(args: &RasterizeArgs, global: &GlobalArgs) -> Result<(), Failure> {
-    cpu_only(global)?;
     let is_ply = |path: &&PathBuf| path.extension().is_some_and(|ending| ending == "ply");
     let (ply, capture) = match (&args.scene, &args.capture) {
         (Some(ply), Some(capture)) => (Some(ply), Some(capture)),
@@ -70,7 +71,7 @@ pub(super) fn report(
 ) -> Result<RasterizeReport, Failure> {
     let folder = capture.unwrap_or(Path::new(EXAMPLE));
     let capture = input.open(Some(folder), global)?;
-    let device = Device::flex();
+    let device = chosen(global)?;
     let (gaussians, settings, name) = match ply {
         Some(ply) => {
             let (gaussians, settings) = scene::open(ply, &device, global)?;
@@ -82,7 +83,7 @@ pub(super) fn report(
             let trainer = Trainer::builder()
                 .capture(capture.clone())
                 .config(config.clone())
-                .device(device)
+                .device(device.clone())
                 .build()?;
             let name = format!("the first Gaussians of {}", capture.name);
             (trainer.gaussians().valid(), config.render_settings(0), name)
@@ -96,6 +97,7 @@ pub(super) fn report(
         &data,
         &views,
         &settings,
+        &device,
         input.seconds,
         say,
     )?)

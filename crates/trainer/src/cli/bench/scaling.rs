@@ -6,25 +6,28 @@ use std::time::Instant;
 
 use clap::Args;
 
-use super::{Failure, GlobalArgs, cpu_only, print, write_svg};
+use super::{DeviceChoice, Failure, GlobalArgs, chosen, print, write_svg};
 use crate::performance::PerformanceError;
-use crate::performance::scaling::{GAUSSIANS, PIXELS, Point, ScalingReport, measure_point};
+use crate::performance::scaling::{
+    GAUSSIANS, PIXELS, PhotoSize, Point, ScalingReport, measure_point,
+};
 use crate::report::metrics::write_json;
 
-/// Step time and memory on the CPU against Gaussians and pixels, on a synthetic scene
+/// Step time and memory against Gaussians and pixels, on a synthetic scene
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   splat bench scaling
   splat bench scaling --gaussians 10000,100000 --pixels 500000 --svg scaling.svg
+  splat bench scaling --gaussians 1000000 --pixels 1920x1080 --device wgpu
 
-Takes some minutes: every point is measured in a process of its own.")]
+Takes some minutes: every point is measured in a process of its own. Measures the CPU unless --device names another.")]
 pub(super) struct ScalingArgs {
     /// Numbers of Gaussians
     #[arg(long, value_name = "N,N,...", value_delimiter = ',', default_values_t = GAUSSIANS)]
     gaussians: Vec<usize>,
-    /// Numbers of pixels
-    #[arg(long, value_name = "P,P,...", value_delimiter = ',', default_values_t = PIXELS)]
-    pixels: Vec<usize>,
+    /// Numbers of pixels, or sizes such as 1920x1080
+    #[arg(long, value_name = "P,P,...", value_delimiter = ',', default_values_t = PIXELS.map(PhotoSize::of_pixels))]
+    pixels: Vec<PhotoSize>,
     /// Also write the figures as JSON
     #[arg(long, value_name = "OUT")]
     json: Option<PathBuf>,
@@ -39,13 +42,12 @@ pub(super) struct ScalingArgs {
 pub(super) struct PointArgs {
     /// Number of Gaussians
     gaussians: usize,
-    /// Number of pixels
-    pixels: usize,
+    /// Size of the photos
+    pixels: PhotoSize,
 }
 
 /// Runs the command.
 pub(super) fn run(args: &ScalingArgs, global: &GlobalArgs) -> Result<(), Failure> {
-    cpu_only(global)?;
     let report = report(&args.gaussians, &args.pixels, global)?;
     print(&format!("{}\n{}", report.machine.line(), report.markdown()));
     if let Some(path) = &args.json {
@@ -59,8 +61,7 @@ pub(super) fn run(args: &ScalingArgs, global: &GlobalArgs) -> Result<(), Failure
 
 /// Measures a point in this process.
 pub(super) fn run_point(args: &PointArgs, global: &GlobalArgs) -> Result<(), Failure> {
-    cpu_only(global)?;
-    let point = measure_point(args.gaussians, args.pixels)?;
+    let point = measure_point(args.gaussians, args.pixels, &chosen(global)?)?;
     print(&serde_json::to_string(&point)?);
     Ok(())
 }
@@ -68,39 +69,43 @@ pub(super) fn run_point(args: &PointArgs, global: &GlobalArgs) -> Result<(), Fai
 /// Measures all points, each in a process of its own.
 pub(super) fn report(
     gaussians: &[usize],
-    pixels: &[usize],
+    sizes: &[PhotoSize],
     global: &GlobalArgs,
 ) -> Result<ScalingReport, Failure> {
-    if let Some(field) = [("--gaussians", gaussians), ("--pixels", pixels)]
-        .into_iter()
-        .find_map(|(field, counts)| counts.contains(&0).then_some(field))
-    {
-        return Err(Failure::BadInput(format!("{field} must be at least 1")));
+    if gaussians.contains(&0) {
+        return Err(Failure::BadInput(
+            "--gaussians must be at least 1".to_owned(),
+        ));
     }
+    let device = chosen(global)?;
     let mut done = 0;
     let start = Instant::now();
-    let measured = ScalingReport::of(gaussians, pixels, |gaussians, pixels| {
+    let measured = ScalingReport::of(gaussians, sizes, &device, |gaussians, size| {
         done += 1;
         global.say(format_args!(
-            "point {done}, {gaussians} Gaussians and {pixels} pixels, after {:.0} s",
+            "point {done}, {gaussians} Gaussians and {size} pixels, after {:.0} s",
             start.elapsed().as_secs_f64()
         ));
-        child(gaussians, pixels)
+        child(gaussians, size, global.device)
     });
     Ok(measured?)
 }
 
 /// Runs `splat bench point`.
-fn child(gaussians: usize, pixels: usize) -> Result<Point, PerformanceError> {
+fn child(
+    gaussians: usize,
+    size: PhotoSize,
+    device: DeviceChoice,
+) -> Result<Point, PerformanceError> {
     let failed = |reason: String| PerformanceError::Point {
         gaussians,
-        pixels,
+        size,
         reason,
     };
     let program = std::env::current_exe().map_err(|error| failed(error.to_string()))?;
     let output = Command::new(program)
-        .args(["--device", "cpu", "--quiet", "bench", "point"])
-        .args([gaussians, pixels].map(|count| count.to_string()))
+        .args(["--device", device.argument(), "--quiet", "bench", "point"])
+        .args([gaussians.to_string(), size.to_string()])
         .output()
         .map_err(|error| failed(error.to_string()))?;
     if !output.status.success() {

@@ -62,7 +62,7 @@ impl MemoryFit {
         let rows: Vec<Row> = points
             .iter()
             .filter_map(|point| {
-                let bytes = point.peak_rss_bytes? as f64;
+                let bytes = point.memory()? as f64;
                 Some((terms(point), bytes))
             })
             .collect();
@@ -180,6 +180,7 @@ mod tests {
             milliseconds: Spread::of(vec![milliseconds]),
             stages: vec![],
             peak_rss_bytes: Some(bytes as u64),
+            device_memory: None,
         }
     }
 

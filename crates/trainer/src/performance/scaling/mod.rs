@@ -9,13 +9,16 @@ mod scene;
 use std::fmt::Write;
 use std::sync::Arc;
 
+use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
+use splat_ops::device::describe;
 
 pub use fit::{MemoryFit, steepest};
-pub use scene::synthetic_capture;
+pub use scene::{PhotoSize, synthetic_capture};
 
-use super::step::{StageColumn, at_degree, run, work, write_stages};
-use super::{Machine, PerformanceError, Spread, Work, all_threads, on_threads};
+use super::device_step::{self, write_device};
+use super::step::{StageColumn, at_degree, run, work_on, write_stages};
+use super::{DeviceMemory, Machine, PerformanceError, Spread, Work, all_threads, on_threads};
 use crate::TrainConfig;
 use crate::report::memory::peak_rss_bytes;
 
@@ -29,12 +32,16 @@ const WARM_UP: usize = 4;
 /// proportion where they are more.
 const STEPS: core::ops::RangeInclusive<usize> = 3..=20;
 const STEP_WORK: usize = 300_000;
+/// Seconds for each way of measuring the steps of a point on a CubeCL device, as far as three steps do.
+const DEVICE_SECONDS: f64 = 5.0;
 
 /// All points.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ScalingReport {
     /// Where and when.
     pub machine: Machine,
+    /// What is known of the CubeCL device; absent where it was the CPU.
+    pub device: Option<Vec<(&'static str, String)>>,
     /// Points in the order they were measured.
     pub points: Vec<Point>,
     /// Memory as a sum over what there is; absent where the system does not say, or too few points were measured.
@@ -56,49 +63,78 @@ pub struct Point {
     pub stages: Vec<(String, f64)>,
     /// Most memory that was resident.
     pub peak_rss_bytes: Option<u64>,
+    /// Memory on the CubeCL device; absent where it was the CPU.
+    pub device_memory: Option<DeviceMemory>,
 }
 
-/// Measures one point in this process.
+impl Point {
+    /// Peak memory: of the device, if it has its own; else of the process.
+    pub fn memory(&self) -> Option<u64> {
+        let device = self.device_memory.map(|memory| memory.most_bytes);
+        device.or(self.peak_rss_bytes)
+    }
+}
+
+/// Measures one point in this process, on `device`.
 ///
 /// # Errors
 /// When a step cannot be taken.
-pub fn measure_point(gaussians: usize, pixels: usize) -> Result<Point, PerformanceError> {
-    let capture = Arc::new(synthetic_capture(gaussians, pixels));
+pub fn measure_point(
+    gaussians: usize,
+    size: PhotoSize,
+    device: &Device,
+) -> Result<Point, PerformanceError> {
+    let capture = Arc::new(synthetic_capture(gaussians, size));
     let config = at_degree(&TrainConfig::default(), 3);
+    if describe(device).is_some() {
+        let run = device_step::run(&capture, &config, device, WARM_UP, DEVICE_SECONDS)?;
+        return Ok(Point {
+            work: work_on(&capture, &config, device)?,
+            threads: 1,
+            steps: run.alone.len(),
+            milliseconds: Spread::of(run.alone).times(1e3),
+            stages: run.staged.stages(),
+            peak_rss_bytes: peak_rss_bytes(),
+            device_memory: Some(run.memory),
+        });
+    }
     let threads = all_threads().into_iter().max().unwrap_or(1);
-    let most = *STEPS.end() * STEP_WORK / (gaussians + pixels).max(1);
+    let most = *STEPS.end() * STEP_WORK / (gaussians + size.pixels()).max(1);
     let steps = most.clamp(*STEPS.start(), *STEPS.end());
     let samples = on_threads(threads, || run(&capture, &config, WARM_UP, steps))?;
     // Before the work is counted, which takes memory too.
     let peak_rss_bytes = peak_rss_bytes();
     Ok(Point {
-        work: work(&capture, &config)?,
+        work: work_on(&capture, &config, device)?,
         threads,
         steps,
         milliseconds: samples.milliseconds(),
         stages: samples.stages(),
         peak_rss_bytes,
+        device_memory: None,
     })
 }
 
 impl ScalingReport {
-    /// Measures all points, each by `measure`, which gets Gaussians and pixels.
+    /// Measures all points on `device`, each by `measure`, which gets Gaussians and size.
     ///
     /// # Errors
     /// That of the first point that has one.
     pub fn of(
         gaussians: &[usize],
-        pixels: &[usize],
-        mut measure: impl FnMut(usize, usize) -> Result<Point, PerformanceError>,
+        sizes: &[PhotoSize],
+        device: &Device,
+        mut measure: impl FnMut(usize, PhotoSize) -> Result<Point, PerformanceError>,
     ) -> Result<Self, PerformanceError> {
         let mut points = vec![];
-        for pixels in pixels {
+        for size in sizes {
             for gaussians in gaussians {
-                points.push(measure(*gaussians, *pixels)?);
+                points.push(measure(*gaussians, *size)?);
             }
         }
         Ok(Self {
             machine: Machine::here(),
+            device: describe(device),
             memory: MemoryFit::of(&points),
             points,
         })
@@ -121,11 +157,21 @@ impl ScalingReport {
     }
 
     fn write(&self, text: &mut String) -> std::fmt::Result {
+        let on = match &self.device {
+            Some(facts) => {
+                write_device(text, facts)?;
+                writeln!(text)?;
+                "the device, each begun and ended while it is idle".to_owned()
+            }
+            None => {
+                let threads = self.points.first().map_or(1, |point| point.threads);
+                format!("{threads} threads")
+            }
+        };
         writeln!(
             text,
-            "Training steps at SH degree 3 on {} threads; random points on four sheets that fill the view, so that a pixel \
-             has about as many Gaussians however many there are. Each point in a process of its own.\n",
-            self.points.first().map_or(1, |point| point.threads)
+            "Training steps at SH degree 3 on {on}; random points on four sheets that fill the view, so that a pixel \
+             has about as many Gaussians however many there are. Each point in a process of its own.\n"
         )?;
         writeln!(
             text,
@@ -136,7 +182,7 @@ impl ScalingReport {
             let work = &point.work;
             let per_pixel = |count: f64| count / work.pixels.max(1.0);
             let Spread { median, min, max } = point.milliseconds;
-            let memory = point.peak_rss_bytes;
+            let memory = point.memory();
             writeln!(
                 text,
                 "| {} | {:.0} | {:.0} | {:.1} | {:.1} | {:.1} | {} | {median:.1} | {min:.1} | {max:.1} | {} |",

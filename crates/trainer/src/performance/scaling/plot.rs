@@ -55,7 +55,7 @@ fn milliseconds(point: &Point) -> Option<f64> {
 }
 
 fn megabytes(point: &Point) -> Option<f64> {
-    Some(point.peak_rss_bytes? as f64 / 1e6)
+    Some(point.memory()? as f64 / 1e6)
 }
 
 /// To a tenth, as images of an asked-for size are.

@@ -1,0 +1,165 @@
+//! CubeCL devices as benchmarks see them: what they are, what the kernels did there, how fast their memory is. Without
+//! such a device (or the features for one) there is nothing to tell.
+
+use burn::tensor::Device;
+#[cfg(feature = "cpu")]
+use burn::tensor::Tensor;
+
+#[cfg(feature = "cpu")]
+use crate::{OpError, Projected, RasterizeSettings, RasterizeWork};
+
+/// What the kernels did since the process began, over all devices; a piece of work is a difference of two.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct KernelWork {
+    /// Kernels of ours that were launched; those of Burn are not seen here.
+    pub launches: u64,
+    /// (Splat, tile) pairs that were listed.
+    pub instances: u64,
+    /// Bytes reserved for results and scratch of our kernels; the same memory may be reserved many times.
+    pub reserved_bytes: u64,
+    /// How often our kernels made the host wait for the device.
+    pub waits: u64,
+}
+
+/// How large a training step is, for [`step_floor`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct StepSizes {
+    /// Gaussians.
+    pub gaussians: u64,
+    /// Those that reach into the view.
+    pub visible: u64,
+    /// (Splat, tile) pairs.
+    pub instances: u64,
+    /// Width of the view in pixels.
+    pub width: u64,
+    /// Height of the view in pixels.
+    pub height: u64,
+    /// Degree of spherical harmonics that is evaluated.
+    pub sh_degree: usize,
+    /// Floats of one Gaussian that are trained.
+    pub parameters: u64,
+}
+
+#[cfg(feature = "cube")]
+pub(crate) fn client(device: &Device) -> Option<cubecl::client::Client> {
+    use burn::backend::DispatchDevice;
+    match device.clone().without_autodiff().as_dispatch() {
+        DispatchDevice::Cube(device) => Some(device.client()),
+        #[allow(unreachable_patterns, reason = "not so without the feature `cpu`")]
+        _ => None,
+    }
+}
+
+/// What is known of a CubeCL device, and which variant of the kernels runs there: name and value, in an order for
+/// reading. `None` for any other device.
+pub fn describe(device: &Device) -> Option<Vec<(&'static str, String)>> {
+    #[cfg(feature = "cube")]
+    return client(device).map(|client| splat_kernels::describe(&client));
+    #[cfg(not(feature = "cube"))]
+    {
+        let _ = device;
+        None
+    }
+}
+
+/// What the kernels did so far.
+pub fn kernel_work() -> KernelWork {
+    #[cfg(feature = "cube")]
+    {
+        let work = splat_kernels::work();
+        KernelWork {
+            launches: work.launches,
+            instances: work.instances,
+            reserved_bytes: work.reserved_bytes,
+            waits: work.waits,
+        }
+    }
+    #[cfg(not(feature = "cube"))]
+    KernelWork::default()
+}
+
+impl KernelWork {
+    /// What was done after `earlier`.
+    #[must_use]
+    pub fn since(self, earlier: Self) -> Self {
+        Self {
+            launches: self.launches - earlier.launches,
+            instances: self.instances - earlier.instances,
+            reserved_bytes: self.reserved_bytes - earlier.reserved_bytes,
+            waits: self.waits - earlier.waits,
+        }
+    }
+}
+
+/// Bytes of device memory that the kernels of a training step with three colours cannot do without: by stage, in order,
+/// read and written together. `splat_kernels::floor` says what is counted and what is estimated. `None` where the
+/// device is none of CubeCL.
+pub fn step_floor(device: &Device, sizes: &StepSizes) -> Option<Vec<(&'static str, u64)>> {
+    #[cfg(feature = "cube")]
+    {
+        let sizes = splat_kernels::floor::Sizes {
+            gaussians: sizes.gaussians,
+            visible: sizes.visible,
+            instances: sizes.instances,
+            width: sizes.width,
+            height: sizes.height,
+            channels: 3,
+            degree: sizes.sh_degree,
+            parameters: sizes.parameters,
+            digit_bits: splat_kernels::sort::digit_bits(&client(device)?),
+        };
+        let stages = splat_kernels::floor::step(&sizes).into_iter();
+        Some(stages.map(|(name, bytes)| (name, bytes.total())).collect())
+    }
+    #[cfg(not(feature = "cube"))]
+    {
+        let _ = (device, sizes);
+        None
+    }
+}
+
+/// Bytes per second, read and written together, of a plain kernel that copies `bytes`: what a stage bound by memory
+/// could reach. `None` where the device is none of CubeCL.
+///
+/// # Errors
+/// The device's error.
+pub fn copy_bandwidth(device: &Device, bytes: usize) -> Result<Option<f64>, OpError> {
+    #[cfg(feature = "cube")]
+    {
+        let Some(client) = client(device) else {
+            return Ok(None);
+        };
+        let measured = splat_kernels::copy::bandwidth(&client, bytes / 4);
+        measured
+            .map(Some)
+            .map_err(|what| OpError::Device { op: "copy", what })
+    }
+    #[cfg(not(feature = "cube"))]
+    {
+        let _ = (device, bytes);
+        Ok(None)
+    }
+}
+
+/// Counts the work of [`rasterize`](crate::rasterize) with the same arguments, by doing it on their device.
+///
+/// A CubeCL device tests other pairs than the CPU: there a block of the tile's pixels (8 x 8, or 4 x 4 where planes are
+/// not known) walks all splats of the tile whose ellipse meets the block, each at all pixels of the block that are still
+/// open. On the CPU rows are cut to the ellipse in steps of eight pixels.
+///
+/// # Errors
+/// As [`rasterize`](crate::rasterize).
+#[cfg(feature = "cpu")]
+pub fn rasterize_work<const DC: usize, const DO: usize>(
+    projected: &Projected,
+    colors: Tensor<DC>,
+    opacities: Tensor<DO>,
+    settings: &RasterizeSettings,
+) -> Result<RasterizeWork, OpError> {
+    #[cfg(feature = "cube")]
+    if let Some(client) = client(&projected.packed().device()) {
+        let (colors, opacities) = crate::rasterize::per_camera(projected, colors, opacities)?;
+        return crate::cube::rasterize_work(&client, projected, colors, opacities, settings);
+    }
+    crate::cpu::rasterize_work(projected, colors, opacities, settings)
+}

@@ -1,0 +1,42 @@
+//! A device in words: what it has that the kernels ask for, and which variant of them runs there.
+
+use cubecl::client::Client;
+use cubecl::features::{AtomicUsage, Plane};
+
+use crate::{rasterize, sort};
+
+/// What is known of the client's device, by name, in an order for reading.
+pub fn describe(client: &Client) -> Vec<(&'static str, String)> {
+    let (identity, hardware) = (&client.properties().identity, &client.properties().hardware);
+    let planes = match (hardware.plane_size_min, hardware.plane_size_max) {
+        (least, most) if least == most => format!("{most} units"),
+        (least, most) => format!("{least} to {most} units"),
+    };
+    let operations = if client.features().plane.contains(Plane::Ops) {
+        "with plane operations"
+    } else {
+        "without plane operations"
+    };
+    let adding = client.features().types.atomic.iter();
+    let adding = adding.filter(|(_, uses)| uses.contains(AtomicUsage::Add));
+    let adding: Vec<String> = adding.map(|(value, _)| value.to_string()).collect();
+    let mut facts = vec![
+        ("name", identity.name.clone()),
+        ("runtime", client.name().to_owned()),
+        ("planes", format!("{planes}, {operations}")),
+        ("atomic addition", adding.join(", ")),
+        (
+            "shared memory",
+            format!("{} bytes a workgroup", hardware.max_shared_memory_size),
+        ),
+    ];
+    if let Some(count) = hardware.num_streaming_multiprocessors {
+        facts.push(("multiprocessors", count.to_string()));
+    }
+    if let Some(bytes) = hardware.last_level_cache_size {
+        facts.push(("last cache", format!("{bytes} bytes")));
+    }
+    facts.push(("rasterize", rasterize::variant(client)));
+    facts.push(("sort", sort::variant(client)));
+    facts
+}

@@ -1,0 +1,87 @@
+//! The bytes of device memory that a training step cannot do without: every stage reads each of its inputs and writes
+//! each of its results once, with a perfect cache within a stage and none between stages.
+//!
+//! Each stage states its own beside its kernels (`floor`); here they are put together for one camera. Counted are the
+//! kernels of this crate alone, not the tensor ops between them. Two estimates are in it: the lists of all tiles count
+//! to their ends, also where all pixels stop earlier; and what is said per Gaussian counts all of them, also those out
+//! of view. Neither is a bound that a kernel could not go below by knowing more than its input.
+
+use crate::{adam, intersect, project, rasterize, sh, sort, ssim};
+
+/// Bytes read and written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Bytes {
+    /// From device memory.
+    pub read: u64,
+    /// To device memory.
+    pub written: u64,
+}
+
+impl Bytes {
+    /// Both ways together.
+    pub fn total(self) -> u64 {
+        self.read + self.written
+    }
+}
+
+impl core::ops::Add for Bytes {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            read: self.read + other.read,
+            written: self.written + other.written,
+        }
+    }
+}
+
+/// How large a training step is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Sizes {
+    /// Gaussians.
+    pub gaussians: u64,
+    /// Those that reach into the view.
+    pub visible: u64,
+    /// (Splat, tile) pairs.
+    pub instances: u64,
+    /// Width of the view.
+    pub width: u64,
+    /// Height of the view.
+    pub height: u64,
+    /// Colour channels.
+    pub channels: u64,
+    /// Degree of spherical harmonics.
+    pub degree: usize,
+    /// Floats of one Gaussian that are trained.
+    pub parameters: u64,
+    /// Bits of a digit of the sort on this device: [`sort::digit_bits`].
+    pub digit_bits: u32,
+}
+
+impl Sizes {
+    pub(crate) fn pixels(&self) -> u64 {
+        self.width * self.height
+    }
+}
+
+/// The stages of a step by name, in order, and the floor of each.
+pub fn step(sizes: &Sizes) -> Vec<(&'static str, Bytes)> {
+    let [project, project_gradient] = project::floor(sizes);
+    let [sh, sh_gradient] = sh::floor(sizes);
+    let [blend, blend_gradient] = rasterize::floor(sizes);
+    let [ssim, ssim_gradient] = ssim::floor(sizes);
+    vec![
+        ("project", project),
+        ("spherical harmonics", sh),
+        (
+            "rasterize",
+            intersect::floor(sizes) + sort::floor(sizes) + blend,
+        ),
+        ("ssim", ssim),
+        ("ssim gradient", ssim_gradient),
+        ("rasterize gradient", blend_gradient),
+        ("project gradient", project_gradient),
+        ("spherical harmonics gradient", sh_gradient),
+        ("adam", adam::floor(sizes)),
+    ]
+}

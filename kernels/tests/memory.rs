@@ -1,0 +1,88 @@
+//! Memory, by the allocator's own count, and its bandwidth: in a process of its own, because the count is of all.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use cubecl::MemoryScope;
+use cubecl::client::Client;
+use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
+use splat_kernels::intersect::Frames;
+use splat_kernels::rasterize::{Kept, RasterizeInputs, RasterizeSettings, rasterize};
+use splat_kernels::{Buffer, copy};
+
+static ALONE: Mutex<()> = Mutex::new(());
+
+fn alone() -> Option<(MutexGuard<'static, ()>, Client)> {
+    let guard = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let device = [DefaultDevice, Cpu]
+        .into_iter()
+        .find_map(|kind| cubecl::Device::wgpu(kind).ok());
+    let Some(device) = device else {
+        eprintln!("\n*** SKIPPED: no wgpu adapter on this machine ***\n");
+        return None;
+    };
+    Some((guard, device.client()))
+}
+
+#[test]
+fn a_picture_keeps_the_bytes_that_are_stated() {
+    let Some((_guard, client)) = alone() else {
+        return;
+    };
+    let in_use = || {
+        let report = client.memory_report(MemoryScope::Device);
+        report.usage().bytes_in_use
+    };
+    for (splats, spread, width) in [(300, 0.5, 160), (20_000, 1.0, 160), (20_000, 0.5, 1600)] {
+        let frames = Frames {
+            cameras: 1,
+            gaussians: splats,
+            width,
+            height: 128,
+            alpha_min: 1.0 / 255.0,
+        };
+        let mut packed = Vec::new();
+        for i in 0..splats {
+            let (x, y) = ((i * 37 % 160) as f32, (i * 53 % 128) as f32);
+            packed.extend([x, y, i as f32, spread, 0.0, spread, 1.0, 40.0, 40.0]);
+        }
+        let inputs = RasterizeInputs {
+            packed: Buffer::from_f32(&client, &packed),
+            colors: Buffer::from_f32(&client, &vec![0.5; splats]),
+            opacities: Buffer::from_f32(&client, &vec![0.3; splats]),
+            background: None,
+            channels: 1,
+        };
+        let settings = RasterizeSettings {
+            alpha_max: 0.99,
+            transmittance_min: 9.999e-5,
+        };
+        let before = in_use();
+        let (image, state) = rasterize(&client, &inputs, &frames, &settings).unwrap();
+        image.read_f32(&client).unwrap();
+        let used = in_use() - before;
+        let room = state.lists.splats.len() as u64;
+        // The image has one channel and alpha.
+        let stated = Kept::PER_SPLAT * splats as u64
+            + Kept::PER_INSTANCE * room
+            + Kept::PER_TILE * frames.tiles() as u64
+            + (Kept::PER_PIXEL + 8) * u64::from(width) * 128;
+        println!("{splats} splats, {room} instances: {used} bytes, stated {stated}");
+        assert!(room >= state.lists.instances as u64 && room > 0);
+        // What went with the last launches is still there: so many bytes whatever the sizes.
+        assert!((stated..stated + 4096).contains(&used));
+    }
+}
+
+#[test]
+fn a_copy_has_a_bandwidth() {
+    let Some((_guard, client)) = alone() else {
+        return;
+    };
+    let [small, large] = [1 << 22, 1 << 25].map(|len| copy::bandwidth(&client, len).unwrap());
+    println!("{:.2} and {:.2} GB/s", small / 1e9, large / 1e9);
+    // Slower than a disk or faster than any memory: something else was timed.
+    assert!((5e7..1e14).contains(&large), "{large}");
+    // Launches alone take as long for eight times as much.
+    assert!(large < 4.0 * small, "{small} {large}");
+    assert!(copy::bandwidth(&client, 0).is_err());
+}
