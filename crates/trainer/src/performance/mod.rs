@@ -4,6 +4,7 @@
 //! Nothing here is a copy of what it measures: steps are those of the [`Trainer`](crate::Trainer), and their stages are
 //! the `tracing` spans in it and in the ops.
 
+mod arithmetic;
 mod device_memory;
 pub mod device_step;
 mod machine;

@@ -11,6 +11,7 @@ use splat_model::{Gaussians, RenderSettings, render};
 use splat_ops::cpu::InstructionSet;
 use splat_ops::device::describe;
 
+use super::arithmetic::{self, Arithmetic};
 use super::device_step::write_device;
 use super::stages::{Recording, Stage};
 use super::work::sample;
@@ -74,6 +75,8 @@ pub struct RasterizeReport {
     pub machine: Machine,
     /// What is known of the CubeCL device that rendered; absent where it was the CPU.
     pub device: Option<Vec<(&'static str, String)>>,
+    /// What one thread of the CPU reaches without lists, spans and memory; absent where a device rendered.
+    pub arithmetic: Option<Arithmetic>,
     /// What was rendered.
     pub scene: String,
     /// The work of a view.
@@ -179,9 +182,17 @@ pub fn measure(
                 .then(|| Spread::of(times(|pass| pass.render_backward))),
         });
     }
+    let arithmetic = match facts {
+        Some(_) => None,
+        None => {
+            say("blending tiles full of splats");
+            Some(arithmetic::measure()?)
+        }
+    };
     Ok(RasterizeReport {
         machine: Machine::here(),
         device: facts,
+        arithmetic,
         scene: scene.to_owned(),
         work,
         rows,
@@ -348,36 +359,58 @@ impl RasterizeReport {
         )?;
         writeln!(
             text,
-            "| threads | direction | median ms | min | max | tested | blended | goal, tested | share of the limit |"
+            "| threads | direction | median ms | min | max | tested | blended | goal, tested | share of what is possible here | share \
+             of the limit |"
         )?;
-        writeln!(text, "|--:|---|{}", "--:|".repeat(7))?;
+        writeln!(text, "|--:|---|{}", "--:|".repeat(8))?;
         for row in &self.rows {
             let threads = row.threads;
             if let Some(Spread { median, min, max }) = row.lists {
                 writeln!(
                     text,
-                    "| {threads} | lists | {median:.2} | {min:.2} | {max:.2} | | | | |"
+                    "| {threads} | lists | {median:.2} | {min:.2} | {max:.2} | | | | | |"
                 )?;
             }
             let goals = limit.goal.map_or([None; 2], |goal| goal.map(Some));
-            let directions = [
-                ("forward", row.forward, goals[0], Some(limit.forward)),
-                ("backward", row.backward, goals[1], limit.backward),
+            let here = self.arithmetic;
+            let here = [
+                here.map(|here| here.forward),
+                here.map(|here| here.backward),
             ];
-            for (direction, rate, goal, limit) in directions {
+            let directions = [
+                (
+                    "forward",
+                    row.forward,
+                    goals[0],
+                    here[0],
+                    Some(limit.forward),
+                ),
+                ("backward", row.backward, goals[1], here[1], limit.backward),
+            ];
+            for (direction, rate, goal, here, limit) in directions {
                 let Spread { median, min, max } = rate.milliseconds;
                 let tested = 1e-9 * rate.tested_per_second;
                 let blended = 1e-9 * rate.blended_per_second;
                 let goal = goal.map_or(String::new(), |goal| format!("{goal:.1}"));
-                let share = limit.map_or("limit not measured".to_owned(), |limit| {
-                    format!("{:.0} %", 100.0 * tested / limit)
-                });
+                let share = |limit: Option<f64>| {
+                    limit.map_or("not measured".to_owned(), |limit| {
+                        format!("{:.0} %", 100.0 * tested / limit)
+                    })
+                };
+                let (here, share) = (share(here), share(limit));
                 writeln!(
                     text,
                     "| {threads} | {direction} | {median:.2} | {min:.2} | {max:.2} | {tested:.2} | {blended:.2} | {goal} | \
-                     {share} |"
+                     {here} | {share} |"
                 )?;
             }
+        }
+        if let Some(Arithmetic { forward, backward }) = self.arithmetic {
+            writeln!(
+                text,
+                "\nPossible here is what the same loops reach on one thread of this machine, in the same run, where every \
+                 pixel of a tile blends every splat and all is in cache: forward {forward:.2}, backward {backward:.2}."
+            )?;
         }
         writeln!(
             text,
