@@ -185,8 +185,10 @@ impl AdaptiveDensity {
                 .zip(host(sums.views))
                 .map(|(total, views)| f64::from(total) / f64::from(views.max(1.0)))
                 .collect();
-            let (plan, refinement) = self.plan(step, &gaussians.to_data(), &gradients);
+            let splats = gaussians.to_data();
+            let (mut plan, refinement) = self.plan(step, &splats, &gradients);
             if refinement != Refinement::default() {
+                plan.arrange(&splats.means);
                 gaussians = apply_plan(gaussians, &plan, logs);
             }
             report = Some(refinement);
@@ -210,13 +212,22 @@ impl AdaptiveDensity {
         let room = settings
             .max_gaussians
             .map_or(usize::MAX, |most| most.saturating_sub(splats.len()));
+        // Where not all can grow, those do that need it most.
+        let mut growing: Vec<usize> = (0..splats.len())
+            .filter(|row| gradients[*row] > settings.grow_gradient)
+            .collect();
+        if growing.len() > room {
+            growing.sort_by(|a, b| gradients[*b].total_cmp(&gradients[*a]));
+            growing.truncate(room);
+            growing.sort_unstable();
+        }
+        let mut growing = growing.into_iter().peekable();
         let mut report = Refinement::default();
         let mut plan = RowPlan::default();
         let mut clones = Vec::new();
         let mut splits = Vec::new();
         for row in 0..splats.len() {
-            let grows =
-                gradients[row] > settings.grow_gradient && clones.len() + splits.len() < room;
+            let grows = growing.next_if_eq(&row).is_some();
             if grows && scale(row) > settings.split_scale {
                 splits.push(row);
                 continue;
@@ -320,6 +331,37 @@ mod tests {
                 .all(|x| x.abs() < 0.6)
         );
         assert_eq!(plan, density.plan(600, &splats(), &GRADIENTS).0);
+    }
+
+    #[test]
+    fn where_not_all_can_grow_those_do_that_need_it_most() {
+        let settings = AdaptiveSettings {
+            max_gaussians: Some(5),
+            ..Default::default()
+        };
+        let density = AdaptiveDensity::new(settings, RUN);
+        let grown = |gradients: [f64; 4]| {
+            let plan = density.plan(600, &splats(), &gradients).0;
+            plan.source[plan.survives.iter().filter(|survives| **survives).count()]
+        };
+        assert_eq!(grown([3e-4, 4e-4, 0.0, 0.0]), 1);
+        assert_eq!(grown([4e-4, 3e-4, 0.0, 0.0]), 0);
+        assert_eq!(grown([4e-4, 3e-4, 5e-4, f64::NAN]), 2);
+    }
+
+    #[test]
+    fn refined_rows_are_neighbours_in_memory_and_keep_their_moments() {
+        let mut plan = RowPlan::default();
+        let means = [[3.0, 3.0, 3.0], [0.0, 0.0, 0.0], [2.9, 3.0, 3.0]];
+        for row in 0..3 {
+            plan.keep(row);
+        }
+        plan.add(1, [0.1, 0.0, 0.0], -0.5);
+        plan.arrange(&means);
+        assert_eq!(plan.source, [1, 1, 2, 0]);
+        assert_eq!(plan.survives, [true, false, true, true]);
+        assert_eq!(plan.mean_offset[1], [0.1, 0.0, 0.0]);
+        assert_eq!(plan.log_scale_offset, [0.0, -0.5, 0.0, 0.0]);
     }
 
     #[test]

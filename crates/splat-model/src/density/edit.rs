@@ -3,6 +3,7 @@
 use burn::module::Param;
 use burn::tensor::{Int, Tensor, TensorData};
 
+use super::morton;
 use crate::adam::{EditLog, RowEdit};
 use crate::{Field, Gaussians};
 
@@ -40,11 +41,27 @@ impl RowPlan {
     /// Drops the new rows for which `keep` is false.
     pub fn retain(&mut self, keep: impl Fn(usize) -> bool) {
         let kept: Vec<usize> = (0..self.source.len()).filter(|i| keep(*i)).collect();
+        self.select(&kept);
+    }
+
+    /// Orders the new rows so that neighbours in space are neighbours in memory, given the old means.
+    pub fn arrange(&mut self, means: &[[f32; 3]]) {
+        let rows = self.source.iter().zip(&self.mean_offset);
+        let means: Vec<[f32; 3]> = rows
+            .map(|(source, offset)| {
+                let mean = means[*source as usize];
+                [0, 1, 2].map(|axis| mean[axis] + offset[axis])
+            })
+            .collect();
+        self.select(&morton::order(&means));
+    }
+
+    fn select(&mut self, rows: &[usize]) {
         *self = Self {
-            source: kept.iter().map(|i| self.source[*i]).collect(),
-            survives: kept.iter().map(|i| self.survives[*i]).collect(),
-            mean_offset: kept.iter().map(|i| self.mean_offset[*i]).collect(),
-            log_scale_offset: kept.iter().map(|i| self.log_scale_offset[*i]).collect(),
+            source: rows.iter().map(|i| self.source[*i]).collect(),
+            survives: rows.iter().map(|i| self.survives[*i]).collect(),
+            mean_offset: rows.iter().map(|i| self.mean_offset[*i]).collect(),
+            log_scale_offset: rows.iter().map(|i| self.log_scale_offset[*i]).collect(),
         };
     }
 }

@@ -5,6 +5,7 @@
 
 mod adaptive;
 mod edit;
+mod morton;
 mod relocation;
 
 pub use adaptive::{AdaptiveDensity, AdaptiveSettings, Refinement, RunShape};
