@@ -1,5 +1,7 @@
 //! What the blending could reach on this machine at this time: tiles full of splats, everything in cache.
 
+use std::panic::resume_unwind;
+use std::thread;
 use std::time::Duration;
 
 use burn::tensor::{Device, Tensor, TensorData};
@@ -18,7 +20,7 @@ const TILES: usize = 64;
 /// Passes that are measured, after one that is not.
 const PASSES: usize = 30;
 
-/// 1e9 pairs per second of one thread, forward and backward: the rasteriser's own loops without lists to walk, spans to
+/// 1e9 pairs per second and thread, forward and backward: the rasteriser's own loops without lists to walk, spans to
 /// find, or memory to wait for.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Arithmetic {
@@ -28,8 +30,26 @@ pub struct Arithmetic {
     pub backward: f64,
 }
 
-/// Measures on one thread of the CPU.
-pub(super) fn measure() -> Result<Arithmetic, PerformanceError> {
+/// Measures on so many threads of the CPU at once, each by itself: their mean.
+pub(super) fn measure(threads: usize) -> Result<Arithmetic, PerformanceError> {
+    let rates: Result<Vec<Arithmetic>, PerformanceError> = thread::scope(|scope| {
+        let threads: Vec<_> = (0..threads).map(|_| scope.spawn(alone)).collect();
+        threads
+            .into_iter()
+            .map(|thread| thread.join().unwrap_or_else(|panic| resume_unwind(panic)))
+            .collect()
+    });
+    let rates = rates?;
+    let mean =
+        |rate: fn(&Arithmetic) -> f64| rates.iter().map(rate).sum::<f64>() / rates.len() as f64;
+    Ok(Arithmetic {
+        forward: mean(|rate| rate.forward),
+        backward: mean(|rate| rate.backward),
+    })
+}
+
+/// Measures on one thread.
+fn alone() -> Result<Arithmetic, PerformanceError> {
     let [forward, backward] = on_threads(1, || {
         let device = Device::flex().autodiff();
         let [packed, colors, opacities] = splats(&device);

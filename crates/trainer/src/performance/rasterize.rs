@@ -75,8 +75,6 @@ pub struct RasterizeReport {
     pub machine: Machine,
     /// What is known of the CubeCL device that rendered; absent where it was the CPU.
     pub device: Option<Vec<(&'static str, String)>>,
-    /// What one thread of the CPU reaches without lists, spans and memory; absent where a device rendered.
-    pub arithmetic: Option<Arithmetic>,
     /// What was rendered.
     pub scene: String,
     /// The work of a view.
@@ -98,6 +96,8 @@ pub struct RasterizeRow {
     pub forward: Rate,
     /// Its gradient.
     pub backward: Rate,
+    /// What so many threads of the CPU reach side by side without lists, spans and memory; absent where a device rendered.
+    pub possible: Option<Arithmetic>,
     /// Milliseconds per view of projection, colours and rasteriser together, and of their gradients; of a CubeCL device
     /// only, idle before and after.
     pub render_forward_milliseconds: Option<Spread>,
@@ -161,6 +161,10 @@ pub fn measure(
             "rasterising {} views on {threads} thread(s)",
             views.len()
         ));
+        let possible = match facts {
+            Some(_) => None,
+            None => Some(arithmetic::measure(threads)?),
+        };
         let passes = on_threads(threads, || passes(data, &views, settings, device, seconds))?;
         let per_view = |pass: &Pass, time: fn(&Pass) -> Duration| {
             1e3 * time(pass).as_secs_f64() / views.len() as f64
@@ -174,6 +178,7 @@ pub fn measure(
             lists: apart.then(|| Spread::of(times(|pass| pass.lists))),
             forward: Rate::new(times(|pass| pass.forward), &work, threads),
             backward: Rate::new(times(|pass| pass.backward), &work, threads),
+            possible,
             render_forward_milliseconds: facts
                 .is_some()
                 .then(|| Spread::of(times(|pass| pass.render_forward))),
@@ -182,17 +187,9 @@ pub fn measure(
                 .then(|| Spread::of(times(|pass| pass.render_backward))),
         });
     }
-    let arithmetic = match facts {
-        Some(_) => None,
-        None => {
-            say("blending tiles full of splats");
-            Some(arithmetic::measure()?)
-        }
-    };
     Ok(RasterizeReport {
         machine: Machine::here(),
         device: facts,
-        arithmetic,
         scene: scene.to_owned(),
         work,
         rows,
@@ -372,7 +369,7 @@ impl RasterizeReport {
                 )?;
             }
             let goals = limit.goal.map_or([None; 2], |goal| goal.map(Some));
-            let here = self.arithmetic;
+            let here = row.possible;
             let here = [
                 here.map(|here| here.forward),
                 here.map(|here| here.backward),
@@ -405,12 +402,24 @@ impl RasterizeReport {
                 )?;
             }
         }
-        if let Some(Arithmetic { forward, backward }) = self.arithmetic {
-            writeln!(
-                text,
-                "\nPossible here is what the same loops reach on one thread of this machine, in the same run, where every \
-                 pixel of a tile blends every splat and all is in cache: forward {forward:.2}, backward {backward:.2}."
-            )?;
+        writeln!(
+            text,
+            "\nPossible here is what the same loops reach on this machine in the same run where every pixel of a tile blends \
+             every splat and all is in cache, each thread by itself:"
+        )?;
+        for row in &self.rows {
+            if let Some(Arithmetic { forward, backward }) = row.possible {
+                let threads = row.threads;
+                let which = if threads == 1 {
+                    "1 thread".to_owned()
+                } else {
+                    format!("each of {threads} threads")
+                };
+                writeln!(
+                    text,
+                    "- {which}: forward {forward:.2}, backward {backward:.2}"
+                )?;
+            }
         }
         writeln!(
             text,
