@@ -3,7 +3,7 @@
 //! `2^-t = 2^n 2^-g` with `|g| <= 1/2`, g exact, and a polynomial of degree 5 for `2^-g`, the same coefficients in the
 //! same order as on the native path of `splat-ops`. Every product and sum is a spelled-out fused multiply-add on both:
 //! where the device fuses, both give the same bits; where it does not, they differ in the last place. No compiler is
-//! left the choice, so that the forward and the backward kernel round alike. Floor: 15 operations.
+//! left the choice, so that the forward and the backward kernel round alike. Floor: 16 operations.
 
 use cubecl::prelude::*;
 
@@ -20,11 +20,13 @@ pub(crate) fn exp2_neg(t: f32) -> f32 {
     let shifted = ROUND - t;
     // n by its bits: shading languages let a compiler cancel ROUND in (ROUND - t) - ROUND.
     let g = t + (i32::reinterpret(shifted) - ROUND_BITS) as f32;
-    let mut p = fma(-0.001_326_472_7f32, g, 0.009_671_513f32);
-    p = fma(p, g, -0.055_507_336f32);
-    p = fma(p, g, 0.240_222_42f32);
-    p = fma(p, g, -0.693_146_94f32);
-    p = fma(p, g, 1.0f32);
+    let square = g * g;
+    let upper = fma(
+        fma(-0.001_326_472_7f32, g, 0.009_671_513f32),
+        square,
+        fma(-0.055_507_336f32, g, 0.240_222_42f32),
+    );
+    let p = fma(upper, square, fma(-0.693_146_94f32, g, 1.0f32));
     // The low bits of `shifted` are n; added to the exponent they multiply by 2^n.
     f32::reinterpret(u32::reinterpret(p) + (u32::reinterpret(shifted) << 23u32))
 }

@@ -223,14 +223,14 @@ fn exp2_neg_f32<const FMA: bool>(t: f32) -> f32 {
     )
 }
 
-/// Horner's rule, coefficients from the highest degree down.
+/// Coefficients from the highest degree down. Estrin's scheme: one operation more than Horner's, but three after each other
+/// instead of five, and how long a pixel has to wait for its exponential is what the loops over pixels take.
 #[inline(always)]
-fn polynomial<const FMA: bool>(coefficients: &[f32; 6], x: f32) -> f32 {
-    let mut p = coefficients[0];
-    for coefficient in &coefficients[1..] {
-        p = f32::multiply_add::<FMA>(p, x, *coefficient);
-    }
-    p
+fn polynomial<const FMA: bool>([c5, c4, c3, c2, c1, c0]: &[f32; 6], x: f32) -> f32 {
+    let fused = f32::multiply_add::<FMA>;
+    let square = x * x;
+    let upper = fused(fused(*c5, x, *c4), square, fused(*c3, x, *c2));
+    fused(upper, square, fused(*c1, x, *c0))
 }
 
 /// As [`EXP2`], of `e^r` on `|r| <= ln(2) / 2`, 9.1e-8.

@@ -4,7 +4,7 @@ use super::super::intersect::TILE;
 use super::super::real::Real;
 use super::super::simd::prefetch;
 use super::blocks::Blocks;
-use super::splat::{AHEAD, Centres, LANES, PIXELS, Splat, Thresholds, Window, block, block_mut};
+use super::splat::{AHEAD, Centres, LANES, PLANE, Splat, Thresholds, Window, block, block_mut};
 use super::work::Tally;
 use super::{Slab, View};
 
@@ -13,23 +13,23 @@ const LOOK: usize = 8;
 
 /// The pixels of a tile while it is being blended.
 pub(super) struct BlendTile<T> {
-    transmittance: [T; PIXELS],
+    transmittance: [T; PLANE],
     /// The least raw alpha that still counts: `alpha_min`, infinity once the pixel has stopped or where
     /// there is none.
-    gate: [T; PIXELS],
+    gate: [T; PLANE],
     /// The place of the splat before which the pixel stopped; `i32::MAX` while it has not.
-    stop: [i32; PIXELS],
+    stop: [i32; PLANE],
     /// D planes of colour.
-    colors: Vec<[T; PIXELS]>,
+    colors: Vec<[T; PLANE]>,
 }
 
 impl<T: Real> BlendTile<T> {
     pub(super) fn new(channels: usize) -> Self {
         Self {
-            transmittance: [T::ONE; PIXELS],
-            gate: [T::of(f64::INFINITY); PIXELS],
-            stop: [i32::MAX; PIXELS],
-            colors: vec![[T::ZERO; PIXELS]; channels],
+            transmittance: [T::ONE; PLANE],
+            gate: [T::of(f64::INFINITY); PLANE],
+            stop: [i32::MAX; PLANE],
+            colors: vec![[T::ZERO; PLANE]; channels],
         }
     }
 
@@ -57,9 +57,15 @@ impl<T: Real> BlendTile<T> {
             let next = list.get(place + AHEAD);
             prefetch(view.splats, next.map(|index| *index as usize));
             for at in blocks.cover(splat, &centres, &open) {
-                let at = usize::from(*at);
-                any_stopped |=
-                    self.add::<FMA>(splat, color, &centres, at, place as i32, &thresholds, tally);
+                any_stopped |= self.add::<FMA>(
+                    splat,
+                    color,
+                    &centres,
+                    *at,
+                    place as i32,
+                    &thresholds,
+                    tally,
+                );
             }
             if place % LOOK == LOOK - 1 && any_stopped != 0 {
                 open = self.open();
@@ -75,9 +81,9 @@ impl<T: Real> BlendTile<T> {
     #[inline(always)]
     fn begin(&mut self, [columns, rows]: [usize; 2], thresholds: &Thresholds<T>) {
         let closed = T::of(f64::INFINITY);
-        self.transmittance = [T::ONE; PIXELS];
-        self.stop = [i32::MAX; PIXELS];
-        self.colors.fill([T::ZERO; PIXELS]);
+        self.transmittance = [T::ONE; PLANE];
+        self.stop = [i32::MAX; PLANE];
+        self.colors.fill([T::ZERO; PLANE]);
         for (row, gates) in self.gate.chunks_exact_mut(TILE).enumerate() {
             for (column, gate) in gates.iter_mut().enumerate() {
                 let exists = row < rows && column < columns;
@@ -113,7 +119,7 @@ impl<T: Real> BlendTile<T> {
         splat: &Splat<T>,
         color: &[T],
         centres: &Centres<T>,
-        at: usize,
+        at: u8,
         place: i32,
         thresholds: &Thresholds<T>,
         tally: &mut impl Tally,
@@ -137,15 +143,18 @@ impl<T: Real> BlendTile<T> {
                 raw >= gate[i] && !thresholds.stops(left[i]),
             );
         }
-        // Once in a pixel's life.
+        // Once in a pixel's life; for all lanes without a branch.
         if any_stops != 0 {
-            let (gate, stop) = (block_mut(&mut self.gate, at), block_mut(&mut self.stop, at));
+            let (mut gate, mut stop) = (gate, *block(&self.stop, at));
             for i in 0..LANES {
-                if thresholds.stops(left[i]) {
-                    (left[i], shares[i]) = (before[i], T::ZERO);
-                    (gate[i], stop[i]) = (T::of(f64::INFINITY), place);
-                }
+                let stops = thresholds.stops(left[i]);
+                left[i] = if stops { before[i] } else { left[i] };
+                shares[i] = if stops { T::ZERO } else { shares[i] };
+                gate[i] = if stops { T::of(f64::INFINITY) } else { gate[i] };
+                stop[i] = if stops { place } else { stop[i] };
             }
+            *block_mut(&mut self.gate, at) = gate;
+            *block_mut(&mut self.stop, at) = stop;
         }
         *block_mut(&mut self.transmittance, at) = left;
         let mut weights = [T::ZERO; LANES];

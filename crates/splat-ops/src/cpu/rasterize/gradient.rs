@@ -20,7 +20,7 @@ use super::super::real::Real;
 use super::super::simd::prefetch;
 use super::View;
 use super::blocks::Blocks;
-use super::splat::{AHEAD, Centres, LANES, Lanes, PIXELS, Splat, Thresholds, block, block_mut};
+use super::splat::{AHEAD, Centres, LANES, Lanes, PLANE, Splat, Thresholds, block, block_mut};
 
 /// Sums per splat before those of its D colours.
 pub(super) const MOMENTS: usize = 6;
@@ -35,23 +35,23 @@ pub(super) struct Upstream<'a, T> {
 /// The pixels of a tile while they are walked back to front.
 pub(super) struct GradientTile<T> {
     /// Transmittance behind the splats walked so far; in front of them after the next one.
-    transmittance: [T; PIXELS],
+    transmittance: [T; PLANE],
     /// What lies behind, as the loss sees it: sum of (c . grad) alpha T over the splats behind, plus
     /// the final transmittance times (background . grad - grad of alpha).
-    behind: [T; PIXELS],
+    behind: [T; PLANE],
     /// The place of the splat before which the pixel stopped.
-    stop: [i32; PIXELS],
+    stop: [i32; PLANE],
     /// D planes: gradient of the image.
-    grad: Vec<[T; PIXELS]>,
+    grad: Vec<[T; PLANE]>,
 }
 
 impl<T: Real> GradientTile<T> {
     pub(super) fn new(channels: usize) -> Self {
         Self {
-            transmittance: [T::ONE; PIXELS],
-            behind: [T::ZERO; PIXELS],
-            stop: [0; PIXELS],
-            grad: vec![[T::ZERO; PIXELS]; channels],
+            transmittance: [T::ONE; PLANE],
+            behind: [T::ZERO; PLANE],
+            stop: [0; PLANE],
+            grad: vec![[T::ZERO; PLANE]; channels],
         }
     }
 
@@ -66,10 +66,10 @@ impl<T: Real> GradientTile<T> {
         channels: usize,
         background: &mut [T],
     ) {
-        self.transmittance = [T::ONE; PIXELS];
-        self.behind = [T::ZERO; PIXELS];
-        self.stop = [0; PIXELS];
-        self.grad.fill([T::ZERO; PIXELS]);
+        self.transmittance = [T::ONE; PLANE];
+        self.behind = [T::ZERO; PLANE];
+        self.stop = [0; PLANE];
+        self.grad.fill([T::ZERO; PLANE]);
         let [columns, rows] = view.inside([tx, ty]);
         for row in 0..rows {
             for column in 0..columns {
@@ -118,12 +118,11 @@ impl<T: Real> GradientTile<T> {
             let mut sums = [[T::ZERO; LANES]; MOMENTS];
             color_sums.fill([T::ZERO; LANES]);
             for at in blocks.before(&mut end, first + place) {
-                let at = usize::from(*at);
                 self.step::<FMA>(
                     splat,
                     color,
                     &centres,
-                    at,
+                    *at,
                     place as i32,
                     &thresholds,
                     &mut sums,
@@ -146,7 +145,7 @@ impl<T: Real> GradientTile<T> {
         splat: &Splat<T>,
         color: &[T],
         centres: &Centres<T>,
-        at: usize,
+        at: u8,
         place: i32,
         thresholds: &Thresholds<T>,
         sums: &mut [Lanes<T>; MOMENTS],

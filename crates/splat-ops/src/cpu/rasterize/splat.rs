@@ -11,8 +11,9 @@ pub(super) const LANES: usize = TILE / 2;
 /// One value per pixel of a block.
 pub(super) type Lanes<T> = [T; LANES];
 
-/// Pixels of a tile.
-pub(super) const PIXELS: usize = TILE * TILE;
+/// Memory for the pixels of a tile, and so much more that a block may begin at any number of eight bits: no index needs a
+/// check.
+pub(super) const PLANE: usize = TILE * TILE + LANES;
 
 /// So many splats before its turn a splat is fetched: it lies anywhere in memory.
 pub(super) const AHEAD: usize = 4;
@@ -137,42 +138,44 @@ impl Window {
     };
 }
 
-/// The values of the block that begins `at` a pixel, which lies within the tile.
+/// The values of the block that begins `at` a pixel.
 #[inline(always)]
-pub(super) fn block<V, const N: usize>(values: &[V; N], at: usize) -> &Lanes<V> {
-    let values = &values[at.min(N - LANES)..];
+pub(super) fn block<V>(values: &[V; PLANE], at: u8) -> &Lanes<V> {
+    let values = &values[usize::from(at)..];
     values.first_chunk().expect("a block is left")
 }
 
 /// As [`block`].
 #[inline(always)]
-pub(super) fn block_mut<V, const N: usize>(values: &mut [V; N], at: usize) -> &mut Lanes<V> {
-    let values = &mut values[at.min(N - LANES)..];
+pub(super) fn block_mut<V>(values: &mut [V; PLANE], at: u8) -> &mut Lanes<V> {
+    let values = &mut values[usize::from(at)..];
     values.first_chunk_mut().expect("a block is left")
 }
 
 /// Centres of the pixels of a tile.
 pub(super) struct Centres<T> {
-    xs: [T; TILE],
+    /// Of more than there are, so that a block may begin at any.
+    xs: [T; TILE + LANES],
     ys: [T; TILE],
 }
 
 impl<T: Real> Centres<T> {
     #[inline(always)]
     pub(super) fn new([tx, ty]: [usize; 2]) -> Self {
-        let along = |tile: usize| core::array::from_fn(|i| T::of((tile * TILE + i) as f64 + 0.5));
+        let along = |tile: usize, i: usize| T::of((tile * TILE + i) as f64 + 0.5);
         Self {
-            xs: along(tx),
-            ys: along(ty),
+            xs: core::array::from_fn(|i| along(tx, i)),
+            ys: core::array::from_fn(|i| along(ty, i)),
         }
     }
 
     /// From a splat's mean to the pixels of the block that begins `at` one: along x of each, along y of all.
     #[inline(always)]
-    pub(super) fn from(&self, mean: [T; 2], at: usize) -> (Lanes<T>, T) {
-        let xs = block(&self.xs, at % TILE);
+    pub(super) fn from(&self, mean: [T; 2], at: u8) -> (Lanes<T>, T) {
+        let at = usize::from(at);
+        let xs = &self.xs[at % TILE..][..LANES];
         let dx = core::array::from_fn(|i| xs[i] - mean[0]);
-        (dx, self.ys[at / TILE % TILE] - mean[1])
+        (dx, self.ys[at / TILE] - mean[1])
     }
 }
 
