@@ -1,8 +1,8 @@
 //! CubeCL kernels for Gaussian splatting, and nothing else: no tensor library.
 //!
 //! One file per stage, the forward pass beside its vector-Jacobian product, in the order of the data's way:
-//! [`project`] and [`sh`] (spherical harmonics) turn Gaussians into screen splats and their colours; [`intersect`]
-//! lists which tiles every splat touches, with [`scan`] and [`sort`]; [`rasterize`] blends each tile front to back;
+//! [`project`] and [`sh_colors`] (of spherical harmonics, [`sh`]) turn Gaussians into screen splats and their colours;
+//! [`intersect`] lists which tiles every splat touches, with [`scan`] and [`sort`]; [`rasterize`] blends each tile front to back;
 //! [`ssim`] and [`adam`] are what else a training step does on every pixel and every parameter; [`blur`] is a window by
 //! itself, [`exp`] our own exponential. [`work`] counts what was launched. Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous,
 //! row-major) and launch kernels without waiting, except where they say so. Sums never use float atomics: the same
@@ -20,8 +20,10 @@ mod math;
 mod planes;
 pub mod project;
 pub mod rasterize;
+mod reduce;
 pub mod scan;
 pub mod sh;
+pub mod sh_colors;
 pub mod sort;
 pub mod ssim;
 mod work;

@@ -70,11 +70,8 @@ pub trait SplatBackend: Backend {
     ) -> [Option<FloatTensor<Self>>; 2];
 
     /// [`sh_colors`](crate::sh_colors): `[N, 1, 3]`, `[N, R, 3]`, means `[N, 3]` and centres `[C, 3]` to `[C, N, 3]`. There
-    /// are higher coefficients exactly when the degree is above 0. Composed of the op above and tensor ops unless a backend
-    /// knows better.
-    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> FloatTensor<Self> {
-        composed::sh_colors(inputs, degree)
-    }
+    /// are higher coefficients exactly when the degree is above 0.
+    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> FloatTensor<Self>;
 
     /// Gradients of the four inputs, given the gradient `[C, N, 3]` of the colours.
     fn sh_colors_backward(
@@ -82,9 +79,7 @@ pub trait SplatBackend: Backend {
         grad: FloatTensor<Self>,
         degree: usize,
         wanted: [bool; 4],
-    ) -> [Option<FloatTensor<Self>>; 4] {
-        composed::sh_colors_backward(inputs, grad, degree, wanted)
-    }
+    ) -> [Option<FloatTensor<Self>>; 4];
 
     /// [`exp`](crate::exp) or [`sigmoid`](crate::sigmoid) of every element. Composed of tensor ops unless a backend knows
     /// better.

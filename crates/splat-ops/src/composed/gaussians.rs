@@ -1,69 +1,9 @@
-//! What belongs to the Gaussians: colours, activations, statistics, rows.
+//! What belongs to the Gaussians: activations, statistics, rows.
 
 use burn::backend::{Backend, TensorMetadata, get_or_init_device_settings, tensor::FloatTensor};
 use burn::tensor::{Shape, Slice};
 
 use crate::activation::Activation;
-use crate::backend::{ShInputs, SplatBackend};
-
-/// `max(SH(mean - centre) + 0.5, 0)`.
-pub(crate) fn sh_colors<B: SplatBackend>(inputs: ShInputs<B>, degree: usize) -> FloatTensor<B> {
-    let [_, _, colors] = raw_colors(inputs, degree);
-    B::float_clamp_min(colors, 0.0.into())
-}
-
-/// Coefficients, directions, and colours before the clamp.
-fn raw_colors<B: SplatBackend>(inputs: ShInputs<B>, degree: usize) -> [FloatTensor<B>; 3] {
-    let (n, c) = (inputs.means.shape()[0], inputs.centers.shape()[0]);
-    let coeffs = match inputs.sh_rest {
-        Some(rest) => B::float_cat(vec![inputs.sh0, rest], 1),
-        None => inputs.sh0,
-    };
-    // Repeats instead of broadcasts, because N may be 0.
-    let means = B::float_reshape(inputs.means, Shape::from([1, n, 3]));
-    let centers = B::float_reshape(inputs.centers, Shape::from([c, 1, 3]));
-    let dirs = B::float_sub(
-        B::float_repeat_dim(means, 0, c),
-        B::float_repeat_dim(centers, 1, n),
-    );
-    let sum = B::spherical_harmonics_forward(coeffs.clone(), dirs.clone(), degree);
-    [coeffs, dirs, B::float_add_scalar(sum, 0.5.into())]
-}
-
-/// Gradients of the four inputs of [`sh_colors`].
-pub(crate) fn sh_colors_backward<B: SplatBackend>(
-    inputs: ShInputs<B>,
-    grad: FloatTensor<B>,
-    degree: usize,
-    wanted: [bool; 4],
-) -> [Option<FloatTensor<B>>; 4] {
-    let [n, c] = [&inputs.means, &inputs.centers].map(|tensor| tensor.shape()[0]);
-    let [coeffs, dirs, colors] = raw_colors(inputs, degree);
-    let stored = coeffs.shape()[1];
-    let hidden = B::float_lower_elem(colors, 0.0.into(), bools::<B>(&grad));
-    let grad = B::float_mask_fill(grad, hidden, 0.0.into());
-    let asked = [wanted[0] || wanted[1], wanted[2] || wanted[3]];
-    let [of_coeffs, of_dirs] = B::spherical_harmonics_backward(coeffs, dirs, grad, degree, asked);
-
-    let coeffs = |wanted: bool, range: core::ops::Range<usize>| {
-        let all = of_coeffs.clone().filter(|_| wanted)?;
-        let part = [0..n, range, 0..3].map(Slice::from);
-        Some(B::float_slice(all, &part))
-    };
-    let dirs = |wanted: bool, over: usize, rows: usize| {
-        let all = of_dirs.clone().filter(|_| wanted)?;
-        Some(B::float_reshape(
-            B::float_sum_dim(all, over),
-            Shape::from([rows, 3]),
-        ))
-    };
-    [
-        coeffs(wanted[0], 0..1),
-        coeffs(wanted[1], 1..stored),
-        dirs(wanted[2], 0, n),
-        dirs(wanted[3], 1, c).map(B::float_neg),
-    ]
-}
 
 /// The function of every element.
 pub(crate) fn activate<B: Backend>(x: FloatTensor<B>, function: Activation) -> FloatTensor<B> {

@@ -8,6 +8,7 @@ mod adam;
 mod blur;
 mod project;
 mod rasterize;
+mod sh_colors;
 mod spherical_harmonics;
 mod ssim;
 #[cfg(all(test, feature = "cpu", feature = "wgpu"))]
@@ -22,7 +23,7 @@ use splat_kernels::Buffer;
 use tracing::trace_span;
 
 use crate::adam::AdamStep;
-use crate::backend::SplatBackend;
+use crate::backend::{ShInputs, SplatBackend};
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
 
@@ -110,6 +111,21 @@ impl SplatBackend for CubeBackend {
         spherical_harmonics::backward(coeffs, dirs, grad, degree, wanted)
     }
 
+    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> CubeTensor {
+        let _span = trace_span!("colours").entered();
+        sh_colors::forward(inputs, degree)
+    }
+
+    fn sh_colors_backward(
+        inputs: ShInputs<Self>,
+        grad: CubeTensor,
+        degree: usize,
+        wanted: [bool; 4],
+    ) -> [Option<CubeTensor>; 4] {
+        let _span = trace_span!("colours gradient").entered();
+        sh_colors::backward(inputs, grad, degree, wanted)
+    }
+
     fn rasterize_forward(
         packed: CubeTensor,
         colors: CubeTensor,
@@ -149,6 +165,7 @@ impl SplatBackend for CubeBackend {
         let _span = trace_span!("blur").entered();
         blur::blur(image, window)
     }
+
     fn ssim_forward(images: [CubeTensor; 2], args: &SsimArgs) -> (CubeTensor, Vec<CubeTensor>) {
         ssim::forward(images, args)
     }
