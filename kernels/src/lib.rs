@@ -11,6 +11,7 @@
 // `if comptime!(...)` decides while a kernel is built; joined to a condition on the device it would decide there.
 #![allow(clippy::collapsible_if)]
 
+pub mod activation;
 pub mod adam;
 pub mod blur;
 pub mod exp;
@@ -22,6 +23,7 @@ pub mod project;
 pub mod rasterize;
 mod reduce;
 pub mod scan;
+pub mod screen_statistics;
 pub mod sh;
 pub mod sh_colors;
 pub mod sort;

@@ -176,13 +176,11 @@ pub trait SplatBackend: Backend {
     }
 
     /// [`ScreenStatistics::add`](crate::ScreenStatistics::add): gradient and extents `[C, N, 2]` and both sums `[N]` to the
-    /// sums with the lengths of `half * gradient` and the views added. Composed of tensor ops unless a backend knows better.
+    /// sums with the lengths of `half * gradient` and the views added.
     fn add_screen_statistics(
         tensors: [FloatTensor<Self>; 4],
         half: [f64; 2],
-    ) -> [FloatTensor<Self>; 2] {
-        composed::screen_statistics::<Self>(tensors, half)
-    }
+    ) -> [FloatTensor<Self>; 2];
 
     /// Parameter, gradient and both moments to parameter and moments after [`adam_step`](crate::adam_step).
     fn adam(tensors: [FloatTensor<Self>; 4], step: &AdamStep) -> [FloatTensor<Self>; 3];

@@ -1,7 +1,10 @@
-//! What belongs to the Gaussians: activations, statistics, rows.
+//! What belongs to the Gaussians: activations, rows.
 
-use burn::backend::{Backend, TensorMetadata, get_or_init_device_settings, tensor::FloatTensor};
-use burn::tensor::{Shape, Slice};
+use burn::backend::{Backend, tensor::FloatTensor};
+#[cfg(feature = "cube")]
+use burn::backend::{TensorMetadata, get_or_init_device_settings};
+#[cfg(feature = "cube")]
+use burn::tensor::Shape;
 
 use crate::activation::Activation;
 
@@ -40,40 +43,6 @@ pub(crate) fn activate_backward<B: Backend>(
     }
 }
 
-/// Sums of screen gradients and of views, with those of one step added.
-pub(crate) fn screen_statistics<B: Backend>(
-    [gradient, extents, gradients, views]: [FloatTensor<B>; 4],
-    half: [f64; 2],
-) -> [FloatTensor<B>; 2] {
-    let shape = gradient.shape();
-    let (c, n) = (shape[0], shape[1]);
-    if n == 0 {
-        return [gradients, views];
-    }
-    let bools = bools::<B>(&gradient);
-    let floats = gradient.dtype();
-    let column = |tensor: &FloatTensor<B>, i: usize| {
-        let part = [0..c, 0..n, i..i + 1].map(Slice::from);
-        B::float_reshape(B::float_slice(tensor.clone(), &part), Shape::from([c, n]))
-    };
-    let square = |i: usize| {
-        let side = B::float_mul_scalar(column(&gradient, i), half[i].into());
-        B::float_mul(side.clone(), side)
-    };
-    let seen = B::float_greater_elem(column(&extents, 0), 0.0.into(), bools);
-    let length = B::float_sqrt(B::float_add(square(0), square(1)));
-    // What is not finite must not hide the other views of the same Gaussian. Written so that NaN fails the comparison.
-    let finite = B::float_lower_equal_elem(length.clone(), f32::MAX.into(), bools);
-    let counts = B::bool_and(seen.clone(), finite);
-    let length = B::float_mask_fill(length, B::bool_not(counts), 0.0.into());
-    let seen = B::bool_into_float(seen, floats.into());
-    let sum = |of: FloatTensor<B>| B::float_reshape(B::float_sum_dim(of, 0), Shape::from([n]));
-    [
-        B::float_add(gradients, sum(length)),
-        B::float_add(views, sum(seen)),
-    ]
-}
-
 /// `after` in the rows whose gradient is not all zero, `before` in the others.
 #[cfg(feature = "cube")]
 pub(crate) fn where_seen<B: Backend>(
@@ -87,7 +56,7 @@ pub(crate) fn where_seen<B: Backend>(
         return after;
     }
     let table = Shape::from([rows, elements / rows]);
-    let bools = bools::<B>(&grad);
+    let bools = get_or_init_device_settings::<B>(&grad.device()).bool_dtype;
     let floats = grad.dtype();
     let any = B::float_greater_elem(B::float_abs(grad), 0.0.into(), bools);
     let count = B::bool_into_float(B::bool_reshape(any, table.clone()), floats.into());
@@ -98,9 +67,4 @@ pub(crate) fn where_seen<B: Backend>(
         Some(before) => B::float_mask_where(after, unseen.clone(), before),
         None => after,
     })
-}
-
-/// The type of masks on the device of a tensor.
-fn bools<B: Backend>(tensor: &FloatTensor<B>) -> burn::tensor::BoolDType {
-    get_or_init_device_settings::<B>(&tensor.device()).bool_dtype
 }

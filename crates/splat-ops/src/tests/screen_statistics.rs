@@ -46,7 +46,12 @@ fn lengths_in_half_images_are_summed_where_seen_and_finite() {
             let error = (gradients[n] - length).abs();
             assert!(error < 1e-5, "{name}: {n}: {} {length}", gradients[n]);
         }
-        let seen = |count: f32| views.iter().zip(1..).any(|(views, n)| *views == n as f32 + count);
+        let seen = |count: f32| {
+            views
+                .iter()
+                .zip(1..)
+                .any(|(views, n)| *views == n as f32 + count)
+        };
         assert!(seen(0.0) && seen(1.0) && seen(2.0), "{views:?}");
     }
 }
