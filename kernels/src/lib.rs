@@ -18,6 +18,7 @@ pub mod exp;
 pub mod intersect;
 mod launch;
 mod math;
+pub mod photometric;
 mod planes;
 pub mod project;
 pub mod rasterize;

@@ -156,7 +156,7 @@ pub trait SplatBackend: Backend {
         composed::photometric::<Self>(rendered, target, args)
     }
 
-    /// The same, and the gradient `[B, H, W, D]` of the mean similarity by what was rendered.
+    /// The same, and what the backend keeps for the gradient.
     fn photometric_tracked(
         rendered: FloatTensor<Self>,
         target: Target<Self>,
@@ -165,14 +165,15 @@ pub trait SplatBackend: Backend {
         composed::photometric_tracked::<Self>(rendered, target, args)
     }
 
-    /// Gradient `[B, H, W, E]` of what was rendered, given that of the similarity and the gradient `[2]` of the means.
+    /// Gradient `[B, H, W, E]` of what was rendered, given what was kept and the gradient `[2]` of the means.
     fn photometric_backward(
         rendered: FloatTensor<Self>,
         target: Target<Self>,
-        slope: FloatTensor<Self>,
+        kept: FloatTensor<Self>,
         grad: FloatTensor<Self>,
+        _args: &SsimArgs,
     ) -> FloatTensor<Self> {
-        composed::photometric_backward::<Self>(rendered, target, slope, grad)
+        composed::photometric_backward::<Self>(rendered, target, kept, grad)
     }
 
     /// [`ScreenStatistics::add`](crate::ScreenStatistics::add): gradient and extents `[C, N, 2]` and both sums `[N]` to the

@@ -6,6 +6,7 @@ mod blur;
 mod device;
 mod exp;
 mod intersect;
+mod photometric;
 mod project;
 mod rasterize;
 mod reference;

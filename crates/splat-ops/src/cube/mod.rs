@@ -7,6 +7,7 @@
 mod activation;
 mod adam;
 mod blur;
+mod photometric;
 mod project;
 mod rasterize;
 mod screen_statistics;
@@ -26,7 +27,7 @@ use tracing::trace_span;
 
 use crate::activation::Activation;
 use crate::adam::AdamStep;
-use crate::backend::{ShInputs, SplatBackend};
+use crate::backend::{ShInputs, SplatBackend, Target};
 use crate::composed;
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
@@ -222,6 +223,31 @@ impl SplatBackend for CubeBackend {
         wanted: [bool; 2],
     ) -> [Option<CubeTensor>; 2] {
         ssim::backward(images, moments, grad, args, wanted)
+    }
+
+    fn photometric(rendered: CubeTensor, target: Target<Self>, args: &SsimArgs) -> CubeTensor {
+        let _span = trace_span!("photometric").entered();
+        photometric::measure(rendered, target, args)
+    }
+
+    fn photometric_tracked(
+        rendered: CubeTensor,
+        target: Target<Self>,
+        args: &SsimArgs,
+    ) -> (CubeTensor, CubeTensor) {
+        let _span = trace_span!("photometric").entered();
+        photometric::measure_tracked(rendered, target, args)
+    }
+
+    fn photometric_backward(
+        rendered: CubeTensor,
+        target: Target<Self>,
+        kept: CubeTensor,
+        grad: CubeTensor,
+        args: &SsimArgs,
+    ) -> CubeTensor {
+        let _span = trace_span!("photometric gradient").entered();
+        photometric::backward(rendered, target, kept, grad, args)
     }
 
     fn add_screen_statistics(tensors: [CubeTensor; 4], half: [f64; 2]) -> [CubeTensor; 2] {
