@@ -379,7 +379,7 @@ fn means_of_tiles(partials: &[f32], means: &mut [f32], tiles: u32, l1: f32, ssim
     }
 }
 
-/// Mean absolute difference and mean similarity [2]. `shape` must fit.
+/// Mean absolute difference and mean similarity `[2]`. `shape` must fit.
 pub fn photometric(client: &Client, images: Images, shape: &PhotometricShape) -> Buffer {
     measure(client, images, shape, false).0
 }
@@ -519,7 +519,8 @@ fn photometric_gradient(
     }
 }
 
-/// Gradient of what was rendered, [B, H, W, E], given what [`photometric_tracked`] kept and the gradient [2] of its means.
+/// Gradient of what was rendered, [B, H, W, E], given what [`photometric_tracked`] kept and the gradient `[2]` of its
+/// means.
 pub fn photometric_vjp(
     client: &Client,
     images: Images,

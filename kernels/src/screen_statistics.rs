@@ -44,8 +44,8 @@ fn add_screen_statistics(
     }
 }
 
-/// Gradients of screen means and extents, both [C, N, 2], and sums of lengths and of views, both [N], to these sums with
-/// the lengths of `half * gradient` and the views added: in their own memory, where nothing else holds it.
+/// Gradients of screen means and extents, both `[C, N, 2]`, and sums of lengths and of views, both `[N]`, to these sums
+/// with the lengths of `half * gradient` and the views added: in their own memory, where nothing else holds it.
 pub fn screen_statistics(
     client: &Client,
     [gradient, extents]: [&Buffer; 2],
