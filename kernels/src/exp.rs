@@ -1,9 +1,10 @@
-//! The exponential, one of our own: device libraries differ from each other by several units in the last place.
+//! Exponentials, of our own: device libraries differ from each other by several units in the last place.
 //!
-//! `2^-t = 2^n 2^-g` with `|g| <= 1/2`, g exact, and a polynomial of degree 5 for `2^-g`, the same coefficients in the
-//! same order as on the native path of `splat-ops`. Every product and sum is a spelled-out fused multiply-add on both:
-//! where the device fuses, both give the same bits; where it does not, they differ in the last place. No compiler is
-//! left the choice, so that the forward and the backward kernel round alike. Floor: 16 operations.
+//! `2^-t = 2^n 2^-g` with `|g| <= 1/2`, g exact, and a polynomial of degree 5 for `2^-g`; `e^x` alike, of any x. Both with
+//! the same coefficients in the same order as on the native path of `splat-ops`. Every product and sum is a spelled-out
+//! fused multiply-add on both: where the device fuses, both give the same bits; where it does not, they differ in the
+//! last place. No compiler is left the choice, so that the forward and the backward kernel round alike. Floor: 16
+//! operations, and 23 of any x.
 
 use cubecl::prelude::*;
 
@@ -29,6 +30,38 @@ pub(crate) fn exp2_neg(t: f32) -> f32 {
     let p = fma(upper, square, fma(-0.693_146_94f32, g, 1.0f32));
     // The low bits of `shifted` are n; added to the exponent they multiply by 2^n.
     f32::reinterpret(u32::reinterpret(p) + (u32::reinterpret(shifted) << 23u32))
+}
+
+/// ln(2) in two parts, the first over 512: n times it is exact.
+const LN2_HIGH: i32 = 355;
+const LN2_LOW: f32 = -2.121_944_4e-4;
+
+/// `exp(x) = 2^n e^r` with `|r| <= ln(2) / 2`, for any x: infinite and zero where that is out of range, NaN for NaN.
+#[cube]
+pub(crate) fn exp(x: f32) -> f32 {
+    // Beyond these the result is infinite or zero anyway. Written so that NaN passes both.
+    let x = select(x < -104.0f32, -104.0f32, x);
+    let x = select(x > 89.0f32, 89.0f32, x);
+    let shifted = fma(x, core::f32::consts::LOG2_E, ROUND);
+    let n = i32::reinterpret(shifted) - ROUND_BITS;
+    // The product in integers: of two of floats, with one factor in common, a compiler may make one.
+    let high = x - (n * LN2_HIGH) as f32 / 512.0f32;
+    let r = fma(-(n as f32), LN2_LOW, high);
+    let mut p = fma(0.008_290_315f32, r, 0.041_897_93f32);
+    p = fma(p, r, 0.166_676_36f32);
+    p = fma(p, r, 0.499_991_5f32);
+    p = fma(p, r, 0.999_999_7f32);
+    p = fma(p, r, 1.0f32);
+    // n may be 128, or -150: neither is the exponent of a normal number, but those of its halves are.
+    let n = u32::reinterpret(n);
+    let half = ((n + 1024u32) >> 1u32) - 512u32;
+    p * two_to(half) * two_to(n - half)
+}
+
+/// `2^n` of a small n, a negative one as its complement: moved into the exponent.
+#[cube]
+fn two_to(n: u32) -> f32 {
+    f32::reinterpret((n << 23u32) + 0x3f80_0000u32)
 }
 
 #[cube(launch)]

@@ -6,7 +6,10 @@
 //! to their ends, also where all pixels stop earlier; and what is said per Gaussian counts all of them, also those out
 //! of view. Neither is a bound that a kernel could not go below by knowing more than its input.
 
-use crate::{adam, intersect, project, rasterize, sh, sort, ssim};
+use crate::{
+    activation, adam, intersect, photometric, project, rasterize, screen_statistics, sh_colors,
+    sort,
+};
 
 /// Bytes read and written.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -66,22 +69,26 @@ impl Sizes {
 
 /// The stages of a step by name, in order, and the floor of each.
 pub fn step(sizes: &Sizes) -> Vec<(&'static str, Bytes)> {
+    let [activations, activations_gradient] = activation::floor(sizes);
     let [project, project_gradient] = project::floor(sizes);
-    let [sh, sh_gradient] = sh::floor(sizes);
+    let [colours, colours_gradient] = sh_colors::floor(sizes);
     let [blend, blend_gradient] = rasterize::floor(sizes);
-    let [ssim, ssim_gradient] = ssim::floor(sizes);
+    let [photometric, photometric_gradient] = photometric::floor(sizes);
     vec![
+        ("activations", activations),
         ("project", project),
-        ("spherical harmonics", sh),
+        ("colours", colours),
         (
             "rasterize",
             intersect::floor(sizes) + sort::floor(sizes) + blend,
         ),
-        ("ssim", ssim),
-        ("ssim gradient", ssim_gradient),
+        ("photometric", photometric),
+        ("photometric gradient", photometric_gradient),
         ("rasterize gradient", blend_gradient),
+        ("colours gradient", colours_gradient),
         ("project gradient", project_gradient),
-        ("spherical harmonics gradient", sh_gradient),
+        ("activations gradient", activations_gradient),
         ("adam", adam::floor(sizes)),
+        ("density", screen_statistics::floor(sizes)),
     ]
 }

@@ -129,6 +129,18 @@ impl Buffer {
         PendingRead(Box::pin(client.read_async(vec![self.handle.clone()])))
     }
 
+    /// For a kernel that reads this buffer as its buffer number `position` and writes a result of the same length: where
+    /// that comes, the same memory if nothing else holds it, and the arguments for both.
+    pub(crate) fn overwritten(self, client: &Client, position: usize) -> (Self, [BufferArg; 2]) {
+        if self.handle.can_mut() {
+            let arguments = [self.arg(), BufferArg::alias(position, self.len.max(1))];
+            return (self, arguments);
+        }
+        let out = Self::empty(client, self.len);
+        let arguments = [self.arg(), out.arg()];
+        (out, arguments)
+    }
+
     /// The buffer as a kernel argument.
     pub(crate) fn arg(&self) -> BufferArg {
         // SAFETY: both constructors make sure that the handle holds `len` elements of four bytes, and every kernel of

@@ -35,11 +35,19 @@ use crate::launch::{Buffer, cube_count, per_element};
 use crate::math::is_finite;
 use crate::project::PACKED;
 
-/// Most channels of one launch; fewer without planes, where a unit has more pixels.
-pub const MAX_CHANNELS: usize = 16;
+/// Most channels of one launch; fewer where a unit has many pixels.
+pub const MAX_CHANNELS: usize = 32;
 
-/// Most gradients of one instance in one launch.
-pub const MAX_SLOT_VALUES: usize = SHAPE_GRADIENTS + MAX_CHANNELS;
+/// Gradients of one instance that a 32-bit index reaches however many instances there are; more of them only of fewer.
+pub const MAX_SLOT_VALUES: usize = SHAPE_GRADIENTS + MAX_CHANNELS / 2;
+
+/// Most channels of one launch of the backward pass, of `most` that it could do: the slots of all instances must fit into
+/// a buffer of `bytes`, and within reach of an index.
+fn slot_channels(most: usize, bytes: u64, instances: usize) -> usize {
+    let floats = (bytes / 4).min(u64::from(u32::MAX));
+    let values = (floats / instances.max(1) as u64) as usize;
+    values.saturating_sub(SHAPE_GRADIENTS).clamp(1, most)
+}
 
 /// Thresholds of the blending.
 #[derive(Clone, Copy, Debug)]
@@ -318,11 +326,13 @@ pub fn rasterize_vjp(
     if shape || wants_colors {
         let background = inputs.background.clone();
         let background = background.unwrap_or_else(|| Buffer::empty(client, 1));
-        for first_channel in (0..channels).step_by(plan.channels()) {
+        let page = client.properties().memory.max_page_size;
+        let width = slot_channels(plan.channels(), page, lists.instances);
+        for first_channel in (0..channels).step_by(width) {
             let layout = SlotLayout {
                 shape,
                 colors: wants_colors,
-                width: plan.channels().min(channels - first_channel),
+                width: width.min(channels - first_channel),
             };
             let slot_gradients = zeros(client, lists.instances * layout.values());
             if lists.instances > 0 {
@@ -379,4 +389,24 @@ pub fn rasterize_vjp(
         (wants_background && inputs.background.is_some())
             .then(|| background_gradient(client, state, grad_output, channels, frames)),
     ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::intersect::MAX_INSTANCES;
+
+    #[test]
+    fn the_more_instances_the_fewer_channels_at_once() {
+        assert_eq!(slot_channels(32, 1 << 40, 0), 32);
+        assert_eq!(slot_channels(32, 1 << 40, 1_000_000), 32);
+        assert_eq!(slot_channels(32, 1 << 40, MAX_INSTANCES as usize), 16);
+        // 128 MiB: 33 floats for each of a million instances, 3 for each of eleven million.
+        assert_eq!(slot_channels(32, 1 << 27, 1_000_000), 27);
+        assert_eq!(slot_channels(32, 1 << 27, 11_000_000), 1);
+        for instances in [1, 1000, 1 << 20, MAX_INSTANCES] {
+            let values = SHAPE_GRADIENTS + slot_channels(32, 1 << 40, instances as usize);
+            assert!(instances * values as u64 <= u64::from(u32::MAX));
+        }
+    }
 }

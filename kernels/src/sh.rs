@@ -11,7 +11,6 @@
 
 use cubecl::prelude::*;
 
-use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 use crate::math::Vec3;
 
@@ -34,9 +33,18 @@ pub const fn functions(degree: usize) -> usize {
     (degree + 1) * (degree + 1)
 }
 
+/// `degree`, cut to [`MAX_DEGREE`] and to what so many coefficients are enough for.
+pub(crate) fn usable_degree(degree: usize, stored: usize) -> usize {
+    let mut degree = degree.min(MAX_DEGREE);
+    while degree > 0 && functions(degree) > stored {
+        degree -= 1;
+    }
+    degree
+}
+
 /// `y[k]` = Y_k(d).
 #[cube]
-fn basis(d: Vec3, y: &mut Array<f32>, #[comptime] degree: usize) {
+pub(crate) fn basis(d: Vec3, y: &mut Array<f32>, #[comptime] degree: usize) {
     y[0] = C0;
     if comptime!(degree >= 1) {
         y[1] = -C1 * d.y;
@@ -64,7 +72,7 @@ fn basis(d: Vec3, y: &mut Array<f32>, #[comptime] degree: usize) {
     }
 }
 
-/// Σ_k g_k ∇Y_k(d), the gradients of [`basis`] term by term.
+/// h = Σ_k g_k ∇Y_k(d), the gradients of [`basis`] term by term.
 #[cube]
 fn basis_vjp(d: Vec3, g: &Array<f32>, #[comptime] degree: usize) -> Vec3 {
     let Vec3 { x, y, z } = d;
@@ -102,9 +110,30 @@ fn basis_vjp(d: Vec3, g: &Array<f32>, #[comptime] degree: usize) -> Vec3 {
     Vec3::new(gx, gy, gz)
 }
 
+/// The gradient of d, given those `g` of the functions of v = d/|d|: (h - v (v · h)) / |d|, h as in [`basis_vjp`].
+#[cube]
+pub(crate) fn direction_vjp(
+    v: Vec3,
+    inverse: f32,
+    g: &Array<f32>,
+    #[comptime] degree: usize,
+) -> Vec3 {
+    let h = basis_vjp(v, g, degree);
+    h.sub(v.scale(v.dot(h))).scale(inverse)
+}
+
+/// `g · coefficient`. A channel without gradient (black, and clamped there) does not look at its coefficient, which may
+/// be infinite.
+#[cube]
+pub(crate) fn guarded_dot(g: Vec3, coefficient: Vec3) -> f32 {
+    select(g.x == 0.0f32, 0.0f32, g.x * coefficient.x)
+        + select(g.y == 0.0f32, 0.0f32, g.y * coefficient.y)
+        + select(g.z == 0.0f32, 0.0f32, g.z * coefficient.z)
+}
+
 /// 1 / |d|, and 0 for the zero direction. By way of d / max|dᵢ|, so that the squares neither overflow nor underflow.
 #[cube]
-fn inverse_length(d: Vec3) -> f32 {
+pub(crate) fn inverse_length(d: Vec3) -> f32 {
     let largest = d.max_abs();
     let mut inverse = 0.0f32;
     if largest > 0.0f32 {
@@ -144,22 +173,6 @@ fn sh_forward(
     }
 }
 
-/// What forward and gradient must move for one camera.
-pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
-    let n = sizes.gaussians;
-    let coefficients = 12 * functions(sizes.degree) as u64;
-    [
-        Bytes {
-            read: (12 + coefficients) * n,
-            written: 12 * n,
-        },
-        Bytes {
-            read: (24 + coefficients) * n,
-            written: (12 + coefficients) * n,
-        },
-    ]
-}
-
 /// Colours [C, N, 3] for coefficients [N, `stored`, 3] and directions [C, N, 3] of any length. Coefficients beyond
 /// `(degree + 1)²` are not read; `degree` is cut to [`MAX_DEGREE`] and to what is stored.
 pub fn evaluate(
@@ -196,11 +209,7 @@ fn sizes(
 ) -> (usize, usize, usize) {
     let gaussians = coefficients.len() / (stored.max(1) * 3);
     let cameras = dirs.len() / 3 / gaussians.max(1);
-    let mut degree = degree.min(MAX_DEGREE);
-    while degree > 0 && functions(degree) > stored {
-        degree -= 1;
-    }
-    (gaussians, cameras, degree)
+    (gaussians, cameras, usable_degree(degree, stored))
 }
 
 /// Gradient of the coefficients: Σ over cameras of Y_k(d / |d|) g; 0 for those that are not read.
@@ -249,7 +258,7 @@ fn sh_backward_coefficients(
     }
 }
 
-/// Gradient of the directions. With v = d/|d| and h = Σ_k ∇Y_k(v) (coefficient_k · g): (h - v (v · h)) / |d|.
+/// Gradient of the directions.
 #[cube(launch)]
 fn sh_backward_dirs(
     coefficients: &[f32],
@@ -274,17 +283,9 @@ fn sh_backward_dirs(
             let mut weights = Array::<f32>::new(comptime!(functions(degree)));
             #[unroll]
             for k in 0..comptime!(functions(degree)) {
-                let coefficient = Vec3::load(coefficients, first + k * 3);
-                // A channel without gradient (black, and clamped there) does not look at its coefficient, which may be
-                // infinite.
-                weights[k] = select(g.x == 0.0f32, 0.0f32, g.x * coefficient.x)
-                    + select(g.y == 0.0f32, 0.0f32, g.y * coefficient.y)
-                    + select(g.z == 0.0f32, 0.0f32, g.z * coefficient.z);
+                weights[k] = guarded_dot(g, Vec3::load(coefficients, first + k * 3));
             }
-            let h = basis_vjp(v, &weights, degree);
-            h.sub(v.scale(v.dot(h)))
-                .scale(inverse)
-                .store(grad_dirs, index * 3);
+            direction_vjp(v, inverse, &weights, degree).store(grad_dirs, index * 3);
         } else {
             Vec3::new(0.0f32, 0.0f32, 0.0f32).store(grad_dirs, index * 3);
         }

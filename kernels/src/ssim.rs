@@ -14,13 +14,12 @@
 
 use cubecl::prelude::*;
 
-use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 
 /// Values along the window's axis that one unit makes.
-const RUN: usize = 8;
+pub(crate) const RUN: usize = 8;
 /// Longest window whose loops are unrolled, so that values stay in registers.
-const UNROLLED_TAPS: usize = 16;
+pub(crate) const UNROLLED_TAPS: usize = 16;
 /// Fields in the memory that the forward keeps: mx, my, q, p.
 const MOMENTS: usize = 4;
 /// Fields whose blur makes a gradient.
@@ -112,7 +111,7 @@ fn neighbour(axis: Axis, first: u32, along: u32, ahead: u32, radius: u32) -> (us
 
 /// `sums[o] = Σ_k window[k] values[o + k]`
 #[cube]
-fn windowed(
+pub(crate) fn windowed(
     values: &Array<f32>,
     window: &Array<f32>,
     sums: &mut Array<f32>,
@@ -143,7 +142,11 @@ fn store_run(sums: &Array<f32>, out: &mut [f32], offset: u32, axis: Axis, first:
 }
 
 #[cube]
-fn load_window(weights: &[f32], #[comptime] taps: usize, #[comptime] unrolled: bool) -> Array<f32> {
+pub(crate) fn load_window(
+    weights: &[f32],
+    #[comptime] taps: usize,
+    #[comptime] unrolled: bool,
+) -> Array<f32> {
     let mut window = Array::<f32>::new(taps);
     #[unroll(unrolled)]
     for k in 0..taps {
@@ -225,15 +228,15 @@ fn down_columns(
 /// The terms of S.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
-struct Terms {
-    a: f32,
-    b: f32,
-    c: f32,
-    d: f32,
+pub(crate) struct Terms {
+    pub a: f32,
+    pub b: f32,
+    pub c: f32,
+    pub d: f32,
 }
 
 #[cube]
-fn terms(mx: f32, my: f32, q: f32, p: f32, c1: f32, c2: f32) -> Terms {
+pub(crate) fn terms(mx: f32, my: f32, q: f32, p: f32, c1: f32, c2: f32) -> Terms {
     let product = mx * my;
     let squares = mx * mx + my * my;
     Terms {
@@ -411,21 +414,6 @@ fn gradient_down_columns(
             }
         }
     }
-}
-
-/// What forward and gradient of one of the images must move.
-pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
-    let values = sizes.pixels() * sizes.channels;
-    [
-        Bytes {
-            read: 8 * values,
-            written: 20 * values,
-        },
-        Bytes {
-            read: 28 * values,
-            written: 4 * values,
-        },
-    ]
 }
 
 /// S of every value of `images` (x, y, both [B, H, W, D]), and mx, my, q, p [4, B, H, W, D] for the gradient.

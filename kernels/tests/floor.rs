@@ -29,18 +29,36 @@ fn floors_are_the_bytes_of_inputs_and_results() {
         written: n * 4 * 9,
     };
     assert_eq!(floors["project"], splats);
-    // Coefficients of degree 3 and directions; colours.
+    // Coefficients of degree 3 and means; colours.
     let colours = Bytes {
         read: n * 4 * (16 * 3 + 3),
         written: n * 4 * 3,
     };
-    assert_eq!(floors["spherical harmonics"], colours);
-    // Two images; their map and four means.
-    let ssim = Bytes {
-        read: pixels * 3 * 8,
-        written: pixels * 3 * 4 * (1 + 4),
+    assert_eq!(floors["colours"], colours);
+    // The image and the photo of 8 bits; three derivatives of each value.
+    let photometric = Bytes {
+        read: pixels * 3 * (4 + 1),
+        written: pixels * 3 * 12,
     };
-    assert_eq!(floors["ssim"], ssim);
+    assert_eq!(floors["photometric"], photometric);
+    // The derivatives and both again; colour and alpha.
+    let photometric = Bytes {
+        read: pixels * 3 * (12 + 4 + 1),
+        written: pixels * 4 * 4,
+    };
+    assert_eq!(floors["photometric gradient"], photometric);
+    // Log-scales and the logit; then these or their values and what comes back.
+    let activations = Bytes {
+        read: n * 4 * 2 * 4,
+        written: n * 4 * 4,
+    };
+    assert_eq!(floors["activations gradient"], activations);
+    // Gradient, extent along x, two sums; the sums.
+    let density = Bytes {
+        read: n * 4 * (2 + 1 + 2),
+        written: n * 4 * 2,
+    };
+    assert_eq!(floors["density"], density);
     // Of an instance: its number, its slot, six of shape, colour; then its nine sums and again; of a pixel the
     // gradient of colour and alpha, what is left, what was walked; of a Gaussian all of its gradients.
     let backward = Bytes {

@@ -4,8 +4,10 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use cubecl::client::Client;
 use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
+use splat_kernels::activation::{Activation, activate};
 use splat_kernels::intersect::Frames;
 use splat_kernels::rasterize::{RasterizeInputs, RasterizeSettings, rasterize};
+use splat_kernels::screen_statistics::screen_statistics;
 use splat_kernels::{Buffer, Work, scan, work};
 
 static ALONE: Mutex<()> = Mutex::new(());
@@ -91,4 +93,37 @@ fn more_instances_than_there_was_room_for_are_listed_again() {
     assert!(lit > 10_000, "{lit} pixels are lit");
     // The host waits once a picture.
     assert_eq!([few.waits, again.waits, at_once.waits], [1; 3]);
+}
+
+#[test]
+fn results_take_the_memory_of_what_nothing_else_holds() {
+    let Some((_guard, client)) = alone() else {
+        return;
+    };
+    let x = Buffer::from_f32(&client, &[0.0, 1.0, -2.0]);
+    let e = [0.0f32, 1.0, -2.0].map(f32::exp);
+    let before = work();
+    let y = activate(&client, x.clone(), Activation::Exp);
+    assert_eq!(work().since(before).reserved_bytes, 12, "x is held");
+    assert_eq!(x.read_f32(&client).unwrap(), [0.0, 1.0, -2.0]);
+    let z = activate(&client, x, Activation::Exp);
+    assert_eq!(work().since(before).reserved_bytes, 12, "x was given away");
+    for values in [y, z].map(|y| y.read_f32(&client).unwrap()) {
+        let close = |(a, b): (&f32, &f32)| (a - b).abs() <= 1e-6 * b;
+        assert!(values.iter().zip(&e).all(close), "{values:?}");
+    }
+
+    let two = |values: [f32; 2]| Buffer::from_f32(&client, &values);
+    let step = two([3.0, 4.0]);
+    let extents = two([1.0, 1.0]);
+    let sums = [
+        Buffer::from_f32(&client, &[1.0]),
+        Buffer::from_f32(&client, &[7.0]),
+    ];
+    let held = sums[0].clone();
+    let before = work();
+    let [lengths, views] = screen_statistics(&client, [&step, &extents], sums, [2.0, 2.0]);
+    assert_eq!(work().since(before).reserved_bytes, 4, "one sum is held");
+    let read = |buffer: Buffer| buffer.read_f32(&client).unwrap();
+    assert_eq!([held, lengths, views].map(read), [[1.0], [11.0], [8.0]]);
 }

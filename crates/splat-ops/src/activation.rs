@@ -14,8 +14,8 @@ pub enum Activation {
     Sigmoid,
 }
 
-/// `exp(x)`, of logarithms of scales for example. The same function as [`Tensor::exp`]; on the CPU in SIMD and parallel,
-/// to 2 units in the last place.
+/// `exp(x)`, of logarithms of scales for example. The same function as [`Tensor::exp`], to 2 units in the last place on
+/// every device; on the CPU in SIMD and parallel.
 pub fn exp<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     activate(x, Activation::Exp)
 }

@@ -70,11 +70,8 @@ pub trait SplatBackend: Backend {
     ) -> [Option<FloatTensor<Self>>; 2];
 
     /// [`sh_colors`](crate::sh_colors): `[N, 1, 3]`, `[N, R, 3]`, means `[N, 3]` and centres `[C, 3]` to `[C, N, 3]`. There
-    /// are higher coefficients exactly when the degree is above 0. Composed of the op above and tensor ops unless a backend
-    /// knows better.
-    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> FloatTensor<Self> {
-        composed::sh_colors(inputs, degree)
-    }
+    /// are higher coefficients exactly when the degree is above 0.
+    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> FloatTensor<Self>;
 
     /// Gradients of the four inputs, given the gradient `[C, N, 3]` of the colours.
     fn sh_colors_backward(
@@ -82,9 +79,7 @@ pub trait SplatBackend: Backend {
         grad: FloatTensor<Self>,
         degree: usize,
         wanted: [bool; 4],
-    ) -> [Option<FloatTensor<Self>>; 4] {
-        composed::sh_colors_backward(inputs, grad, degree, wanted)
-    }
+    ) -> [Option<FloatTensor<Self>>; 4];
 
     /// [`exp`](crate::exp) or [`sigmoid`](crate::sigmoid) of every element. Composed of tensor ops unless a backend knows
     /// better.
@@ -161,7 +156,7 @@ pub trait SplatBackend: Backend {
         composed::photometric::<Self>(rendered, target, args)
     }
 
-    /// The same, and the gradient `[B, H, W, D]` of the mean similarity by what was rendered.
+    /// The same, and what the backend keeps for the gradient.
     fn photometric_tracked(
         rendered: FloatTensor<Self>,
         target: Target<Self>,
@@ -170,24 +165,23 @@ pub trait SplatBackend: Backend {
         composed::photometric_tracked::<Self>(rendered, target, args)
     }
 
-    /// Gradient `[B, H, W, E]` of what was rendered, given that of the similarity and the gradient `[2]` of the means.
+    /// Gradient `[B, H, W, E]` of what was rendered, given what was kept and the gradient `[2]` of the means.
     fn photometric_backward(
         rendered: FloatTensor<Self>,
         target: Target<Self>,
-        slope: FloatTensor<Self>,
+        kept: FloatTensor<Self>,
         grad: FloatTensor<Self>,
+        _args: &SsimArgs,
     ) -> FloatTensor<Self> {
-        composed::photometric_backward::<Self>(rendered, target, slope, grad)
+        composed::photometric_backward::<Self>(rendered, target, kept, grad)
     }
 
     /// [`ScreenStatistics::add`](crate::ScreenStatistics::add): gradient and extents `[C, N, 2]` and both sums `[N]` to the
-    /// sums with the lengths of `half * gradient` and the views added. Composed of tensor ops unless a backend knows better.
+    /// sums with the lengths of `half * gradient` and the views added.
     fn add_screen_statistics(
         tensors: [FloatTensor<Self>; 4],
         half: [f64; 2],
-    ) -> [FloatTensor<Self>; 2] {
-        composed::screen_statistics::<Self>(tensors, half)
-    }
+    ) -> [FloatTensor<Self>; 2];
 
     /// Parameter, gradient and both moments to parameter and moments after [`adam_step`](crate::adam_step).
     fn adam(tensors: [FloatTensor<Self>; 4], step: &AdamStep) -> [FloatTensor<Self>; 3];

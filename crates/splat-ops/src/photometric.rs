@@ -11,7 +11,7 @@ use crate::ssim::SsimArgs;
 /// What [`photometric`] compares with, `[B, H, W, D]`.
 #[derive(Debug, Clone)]
 pub enum Target {
-    /// 8-bit levels, 0 to 255, that stand for `level / 255`. Of type U8 the CPU reads them as they are.
+    /// 8-bit levels, 0 to 255, that stand for `level / 255`. Of type U8 they are read as they are, on GPUs of type I32 too.
     Levels(Tensor<4, Int>),
     /// The values themselves.
     Values(Tensor<4>),

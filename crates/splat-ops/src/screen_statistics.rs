@@ -18,8 +18,8 @@ pub struct ScreenStatistics {
 
 impl ScreenStatistics {
     /// Adds a step: gradients of the screen means `[C, N, 2]` in 1 / pixels, of a loss that is a mean over C cameras, and
-    /// extents `[C, N, 2]`, positive where a camera sees the Gaussian. A gradient that is not finite counts as zero. On
-    /// the CPU one pass over memory, in place where nothing else holds the statistics. Not differentiable.
+    /// extents `[C, N, 2]`, positive where a camera sees the Gaussian. A gradient that is not finite counts as zero.
+    /// One pass over memory, in place where nothing else holds the statistics. Not differentiable.
     ///
     /// # Errors
     /// When shapes, types or devices do not fit.

@@ -8,3 +8,10 @@ use cubecl::prelude::*;
 pub(crate) fn is_finite(value: f32) -> bool {
     (u32::reinterpret(value) & 0x7f80_0000u32) != 0x7f80_0000u32
 }
+
+/// Less than zero, by the bits: false for NaN and for either zero.
+#[cube]
+pub(crate) fn is_below_zero(value: f32) -> bool {
+    let bits = u32::reinterpret(value);
+    bits > 0x8000_0000u32 && bits <= 0xff80_0000u32
+}

@@ -7,7 +7,8 @@ use cubecl::prelude::*;
 
 use super::RasterizeState;
 use crate::intersect::Frames;
-use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
+use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count};
+use crate::reduce::{sum_blocks, sum_units};
 
 /// Pixels of one unit of the background's gradient.
 const BACKGROUND_ITEMS: usize = 16;
@@ -39,41 +40,10 @@ fn background_partials(
                 }
             }
         }
-        shared[unit] = sum;
-        sync_cube();
-        let mut half = (CUBE_UNITS_USIZE / 2).runtime();
-        while half > 0 {
-            if unit < half {
-                let other = shared[unit + half];
-                shared[unit] += other;
-            }
-            sync_cube();
-            half /= 2;
-        }
+        let sum = sum_units(&mut shared, sum, CUBE_UNITS_USIZE);
         if unit == 0 && camera < cameras as usize {
-            partials[CUBE_POS * channels as usize + channel] = shared[0];
+            partials[CUBE_POS * channels as usize + channel] = sum;
         }
-        sync_cube();
-    }
-}
-
-/// `out[camera, channel]` = Σ over blocks, in order.
-#[cube(launch)]
-fn sum_background_partials(
-    partials: &[f32],
-    out: &mut [f32],
-    cameras: u32,
-    blocks: u32,
-    channels: u32,
-) {
-    let camera = ABSOLUTE_POS as u32 / channels;
-    let channel = ABSOLUTE_POS as u32 % channels;
-    if camera < cameras {
-        let mut sum = 0.0f32;
-        for block in 0..blocks {
-            sum += partials[((camera * blocks + block) * channels + channel) as usize];
-        }
-        out[ABSOLUTE_POS] = sum;
     }
 }
 
@@ -87,8 +57,7 @@ pub(super) fn background_gradient(
     let pixels = frames.width as usize * frames.height as usize;
     let blocks = pixels.div_ceil(BACKGROUND_BLOCK);
     let partials = Buffer::empty(client, frames.cameras * blocks * channels);
-    let out = Buffer::empty(client, frames.cameras * channels);
-    if let Some((count, dim)) = per_element(out.len()) {
+    if !partials.is_empty() {
         background_partials::launch(
             client,
             cube_count(frames.cameras * blocks),
@@ -101,16 +70,6 @@ pub(super) fn background_gradient(
             blocks as u32,
             channels as u32,
         );
-        sum_background_partials::launch(
-            client,
-            count,
-            dim,
-            partials.arg(),
-            out.arg(),
-            frames.cameras as u32,
-            blocks as u32,
-            channels as u32,
-        );
     }
-    out
+    sum_blocks(client, &partials, [frames.cameras, blocks, channels])
 }

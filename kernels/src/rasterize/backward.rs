@@ -14,14 +14,16 @@
 use cubecl::prelude::*;
 
 use super::pair::{SHAPE, Shape, Thresholds, UNSEEN, sample};
-use super::tile::{BATCH, Batch, Plan, pixel_index, place};
+use super::tile::{BATCH, Batch, Plan, WORDS, pixel_index, place};
 use crate::intersect::Grid;
 use crate::project::PACKED;
 
 /// Gradients of a splat's shape and opacity in a slot, in the order of [`SHAPE`]; those of colours follow.
 pub(super) const SHAPE_GRADIENTS: usize = SHAPE;
 
-/// Most floats of partial sums in shared memory: with the batch less than the 16 KiB that every device has.
+/// Floats in the shared memory that every device has.
+const SHARED: usize = 16_384 / 4;
+/// Most floats of partial sums in it, where the batch leaves as many.
 const MAX_PARTIALS: usize = 2304;
 
 /// Which values a launch of the backward pass sums, and how many there are.
@@ -44,9 +46,15 @@ impl SlotLayout {
         if self.shape { SHAPE_GRADIENTS } else { 0 }
     }
 
+    /// Floats in shared memory beside the partial sums: the batch, its slots and bits, and how far the blocks have walked.
+    fn batch(self, plan: Plan) -> usize {
+        BATCH * (SHAPE + self.width) + 2 * BATCH + plan.blocks() * (WORDS + 1) + 2
+    }
+
     /// Splats whose partial sums are in shared memory at once: a power of two, so that they share a word of bits.
     fn group(self, plan: Plan) -> usize {
-        let most = MAX_PARTIALS / (self.values() * plan.blocks());
+        let room = SHARED.saturating_sub(self.batch(plan)).min(MAX_PARTIALS);
+        let most = room / (self.values() * plan.blocks());
         let power = usize::BITS - 1 - most.max(1).leading_zeros();
         1 << power.min(5)
     }
@@ -384,15 +392,13 @@ fn spread(
 
 #[cfg(test)]
 mod tests {
-    use super::super::MAX_CHANNELS;
-    use super::super::tile::WORDS;
     use super::*;
 
     #[test]
     fn every_layout_fits_into_the_shared_memory_of_any_device() {
         for lanes in [1, 8, 16, 32, 64] {
             let plan = Plan::with_lanes(lanes);
-            for width in 1..=MAX_CHANNELS {
+            for width in 1..=plan.channels() {
                 for (shape, colors) in [(true, true), (true, false), (false, true)] {
                     let layout = SlotLayout {
                         shape,
@@ -401,9 +407,8 @@ mod tests {
                     };
                     let group = layout.group(plan);
                     assert!(32 % group == 0, "a group shares a word of bits");
-                    let batch = BATCH * (SHAPE + width) + 2 * BATCH + plan.blocks() * WORDS;
                     let partials = group * layout.values() * plan.blocks();
-                    let bytes = 4 * (batch + partials + plan.blocks() + 2);
+                    let bytes = 4 * (layout.batch(plan) + partials);
                     assert!(bytes <= 16_384, "{bytes} bytes: {lanes} lanes, {layout:?}");
                 }
             }

@@ -1,4 +1,4 @@
-//! `photometric`: saves both images and the gradient of the similarity, which the forward makes in passing.
+//! `photometric`: saves both images and what the backend has made in passing for the gradient.
 
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
@@ -16,7 +16,8 @@ struct PhotometricBackward;
 struct State<B: SplatBackend> {
     rendered: FloatTensor<B>,
     target: Target<B>,
-    slope: FloatTensor<B>,
+    kept: FloatTensor<B>,
+    args: SsimArgs,
 }
 
 impl<B: SplatBackend> Backward<B, 1> for PhotometricBackward {
@@ -28,11 +29,12 @@ impl<B: SplatBackend> Backward<B, 1> for PhotometricBackward {
         let State {
             rendered,
             target,
-            slope,
+            kept,
+            args,
         } = ops.state;
         let value = parents[0]
             .is_some()
-            .then(|| B::photometric_backward(rendered, target, slope, grad));
+            .then(|| B::photometric_backward(rendered, target, kept, grad, &args));
         register::<B, 1>(grads, parents, [value]);
     }
 }
@@ -53,11 +55,12 @@ pub(super) fn photometric<B: SplatBackend, C: CheckpointStrategy>(
     };
     match prep {
         OpsKind::Tracked(prep) => {
-            let (means, slope) = B::photometric_tracked(rendered.clone(), target.clone(), &args);
+            let (means, kept) = B::photometric_tracked(rendered.clone(), target.clone(), &args);
             let state = State {
                 rendered,
                 target,
-                slope,
+                kept,
+                args,
             };
             prep.finish(state, means)
         }

@@ -1,69 +1,12 @@
-//! What belongs to the Gaussians: colours, activations, statistics, rows.
+//! What belongs to the Gaussians: activations, rows.
 
-use burn::backend::{Backend, TensorMetadata, get_or_init_device_settings, tensor::FloatTensor};
-use burn::tensor::{Shape, Slice};
+use burn::backend::{Backend, tensor::FloatTensor};
+#[cfg(feature = "cube")]
+use burn::backend::{TensorMetadata, get_or_init_device_settings};
+#[cfg(feature = "cube")]
+use burn::tensor::Shape;
 
 use crate::activation::Activation;
-use crate::backend::{ShInputs, SplatBackend};
-
-/// `max(SH(mean - centre) + 0.5, 0)`.
-pub(crate) fn sh_colors<B: SplatBackend>(inputs: ShInputs<B>, degree: usize) -> FloatTensor<B> {
-    let [_, _, colors] = raw_colors(inputs, degree);
-    B::float_clamp_min(colors, 0.0.into())
-}
-
-/// Coefficients, directions, and colours before the clamp.
-fn raw_colors<B: SplatBackend>(inputs: ShInputs<B>, degree: usize) -> [FloatTensor<B>; 3] {
-    let (n, c) = (inputs.means.shape()[0], inputs.centers.shape()[0]);
-    let coeffs = match inputs.sh_rest {
-        Some(rest) => B::float_cat(vec![inputs.sh0, rest], 1),
-        None => inputs.sh0,
-    };
-    // Repeats instead of broadcasts, because N may be 0.
-    let means = B::float_reshape(inputs.means, Shape::from([1, n, 3]));
-    let centers = B::float_reshape(inputs.centers, Shape::from([c, 1, 3]));
-    let dirs = B::float_sub(
-        B::float_repeat_dim(means, 0, c),
-        B::float_repeat_dim(centers, 1, n),
-    );
-    let sum = B::spherical_harmonics_forward(coeffs.clone(), dirs.clone(), degree);
-    [coeffs, dirs, B::float_add_scalar(sum, 0.5.into())]
-}
-
-/// Gradients of the four inputs of [`sh_colors`].
-pub(crate) fn sh_colors_backward<B: SplatBackend>(
-    inputs: ShInputs<B>,
-    grad: FloatTensor<B>,
-    degree: usize,
-    wanted: [bool; 4],
-) -> [Option<FloatTensor<B>>; 4] {
-    let [n, c] = [&inputs.means, &inputs.centers].map(|tensor| tensor.shape()[0]);
-    let [coeffs, dirs, colors] = raw_colors(inputs, degree);
-    let stored = coeffs.shape()[1];
-    let hidden = B::float_lower_elem(colors, 0.0.into(), bools::<B>(&grad));
-    let grad = B::float_mask_fill(grad, hidden, 0.0.into());
-    let asked = [wanted[0] || wanted[1], wanted[2] || wanted[3]];
-    let [of_coeffs, of_dirs] = B::spherical_harmonics_backward(coeffs, dirs, grad, degree, asked);
-
-    let coeffs = |wanted: bool, range: core::ops::Range<usize>| {
-        let all = of_coeffs.clone().filter(|_| wanted)?;
-        let part = [0..n, range, 0..3].map(Slice::from);
-        Some(B::float_slice(all, &part))
-    };
-    let dirs = |wanted: bool, over: usize, rows: usize| {
-        let all = of_dirs.clone().filter(|_| wanted)?;
-        Some(B::float_reshape(
-            B::float_sum_dim(all, over),
-            Shape::from([rows, 3]),
-        ))
-    };
-    [
-        coeffs(wanted[0], 0..1),
-        coeffs(wanted[1], 1..stored),
-        dirs(wanted[2], 0, n),
-        dirs(wanted[3], 1, c).map(B::float_neg),
-    ]
-}
 
 /// The function of every element.
 pub(crate) fn activate<B: Backend>(x: FloatTensor<B>, function: Activation) -> FloatTensor<B> {
@@ -100,40 +43,6 @@ pub(crate) fn activate_backward<B: Backend>(
     }
 }
 
-/// Sums of screen gradients and of views, with those of one step added.
-pub(crate) fn screen_statistics<B: Backend>(
-    [gradient, extents, gradients, views]: [FloatTensor<B>; 4],
-    half: [f64; 2],
-) -> [FloatTensor<B>; 2] {
-    let shape = gradient.shape();
-    let (c, n) = (shape[0], shape[1]);
-    if n == 0 {
-        return [gradients, views];
-    }
-    let bools = bools::<B>(&gradient);
-    let floats = gradient.dtype();
-    let column = |tensor: &FloatTensor<B>, i: usize| {
-        let part = [0..c, 0..n, i..i + 1].map(Slice::from);
-        B::float_reshape(B::float_slice(tensor.clone(), &part), Shape::from([c, n]))
-    };
-    let square = |i: usize| {
-        let side = B::float_mul_scalar(column(&gradient, i), half[i].into());
-        B::float_mul(side.clone(), side)
-    };
-    let seen = B::float_greater_elem(column(&extents, 0), 0.0.into(), bools);
-    let length = B::float_sqrt(B::float_add(square(0), square(1)));
-    // What is not finite must not hide the other views of the same Gaussian. Written so that NaN fails the comparison.
-    let finite = B::float_lower_equal_elem(length.clone(), f32::MAX.into(), bools);
-    let counts = B::bool_and(seen.clone(), finite);
-    let length = B::float_mask_fill(length, B::bool_not(counts), 0.0.into());
-    let seen = B::bool_into_float(seen, floats.into());
-    let sum = |of: FloatTensor<B>| B::float_reshape(B::float_sum_dim(of, 0), Shape::from([n]));
-    [
-        B::float_add(gradients, sum(length)),
-        B::float_add(views, sum(seen)),
-    ]
-}
-
 /// `after` in the rows whose gradient is not all zero, `before` in the others.
 #[cfg(feature = "cube")]
 pub(crate) fn where_seen<B: Backend>(
@@ -147,7 +56,7 @@ pub(crate) fn where_seen<B: Backend>(
         return after;
     }
     let table = Shape::from([rows, elements / rows]);
-    let bools = bools::<B>(&grad);
+    let bools = get_or_init_device_settings::<B>(&grad.device()).bool_dtype;
     let floats = grad.dtype();
     let any = B::float_greater_elem(B::float_abs(grad), 0.0.into(), bools);
     let count = B::bool_into_float(B::bool_reshape(any, table.clone()), floats.into());
@@ -158,9 +67,4 @@ pub(crate) fn where_seen<B: Backend>(
         Some(before) => B::float_mask_where(after, unseen.clone(), before),
         None => after,
     })
-}
-
-/// The type of masks on the device of a tensor.
-fn bools<B: Backend>(tensor: &FloatTensor<B>) -> burn::tensor::BoolDType {
-    get_or_init_device_settings::<B>(&tensor.device()).bool_dtype
 }

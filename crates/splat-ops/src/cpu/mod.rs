@@ -226,6 +226,7 @@ impl SplatBackend for Flex {
         target: Target<Self>,
         slope: FlexTensor,
         grad: FlexTensor,
+        _args: &SsimArgs,
     ) -> FlexTensor {
         let _span = trace_span!("photometric gradient").entered();
         in_precision!(

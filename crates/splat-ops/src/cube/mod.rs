@@ -4,10 +4,14 @@
 //!
 //! The `tracing` spans have the names of those on the CPU, and last as long as it takes to launch the kernels: these run on.
 
+mod activation;
 mod adam;
 mod blur;
+mod photometric;
 mod project;
 mod rasterize;
+mod screen_statistics;
+mod sh_colors;
 mod spherical_harmonics;
 mod ssim;
 #[cfg(all(test, feature = "cpu", feature = "wgpu"))]
@@ -24,8 +28,10 @@ use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::Buffer;
 use tracing::trace_span;
 
+use crate::activation::Activation;
 use crate::adam::AdamStep;
-use crate::backend::SplatBackend;
+use crate::backend::{ShInputs, SplatBackend, Target};
+use crate::composed;
 use crate::settings::{ProjectArgs, RasterizeArgs};
 use crate::ssim::SsimArgs;
 
@@ -45,6 +51,25 @@ fn buffer(tensor: &CubeTensor) -> Buffer {
     // A contiguous tensor of f32 holds its elements. One that did not would be read as empty: every kernel checks
     // bounds.
     Buffer::new(tensor.handle.clone(), len).unwrap_or_else(|_| Buffer::empty(&tensor.client, 0))
+}
+
+/// The same, of a tensor that nothing else needs: where nothing else holds the memory, a kernel may write into it. And
+/// what makes a tensor of a buffer, like the one that was taken.
+fn taken(tensor: CubeTensor) -> (Buffer, impl FnOnce(Buffer) -> CubeTensor) {
+    let shape = tensor.shape();
+    let CubeTensor {
+        client,
+        device,
+        handle,
+        ..
+    } = tensor;
+    let memory = Buffer::new(handle, shape.num_elements());
+    let memory = memory.unwrap_or_else(|_| Buffer::empty(&client, 0));
+    let tensor = move |buffer: Buffer| {
+        let handle = buffer.into_handle();
+        CubeTensor::new_contiguous(client, device, shape, handle, DType::F32)
+    };
+    (memory, tensor)
 }
 
 /// A tensor of `shape` on the device of `like`, in the memory of `buffer`.
@@ -113,6 +138,42 @@ impl SplatBackend for CubeBackend {
         spherical_harmonics::backward(coeffs, dirs, grad, degree, wanted)
     }
 
+    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> CubeTensor {
+        let _span = trace_span!("colours").entered();
+        sh_colors::forward(inputs, degree)
+    }
+
+    fn sh_colors_backward(
+        inputs: ShInputs<Self>,
+        grad: CubeTensor,
+        degree: usize,
+        wanted: [bool; 4],
+    ) -> [Option<CubeTensor>; 4] {
+        let _span = trace_span!("colours gradient").entered();
+        sh_colors::backward(inputs, grad, degree, wanted)
+    }
+
+    fn activate(x: CubeTensor, function: Activation) -> CubeTensor {
+        let _span = trace_span!("activations").entered();
+        match x.dtype {
+            DType::F32 => activation::forward(x, function),
+            _ => composed::activate::<Self>(x, function),
+        }
+    }
+
+    fn activate_backward(
+        x: CubeTensor,
+        y: CubeTensor,
+        grad: CubeTensor,
+        function: Activation,
+    ) -> CubeTensor {
+        let _span = trace_span!("activations gradient").entered();
+        match x.dtype {
+            DType::F32 => activation::backward([x, y], grad, function),
+            _ => composed::activate_backward::<Self>(x, y, grad, function),
+        }
+    }
+
     fn rasterize_forward(
         packed: CubeTensor,
         colors: CubeTensor,
@@ -167,6 +228,35 @@ impl SplatBackend for CubeBackend {
     ) -> [Option<CubeTensor>; 2] {
         let _span = trace_span!("ssim gradient").entered();
         ssim::backward(images, moments, grad, args, wanted)
+    }
+
+    fn photometric(rendered: CubeTensor, target: Target<Self>, args: &SsimArgs) -> CubeTensor {
+        let _span = trace_span!("photometric").entered();
+        photometric::measure(rendered, target, args)
+    }
+
+    fn photometric_tracked(
+        rendered: CubeTensor,
+        target: Target<Self>,
+        args: &SsimArgs,
+    ) -> (CubeTensor, CubeTensor) {
+        let _span = trace_span!("photometric").entered();
+        photometric::measure_tracked(rendered, target, args)
+    }
+
+    fn photometric_backward(
+        rendered: CubeTensor,
+        target: Target<Self>,
+        kept: CubeTensor,
+        grad: CubeTensor,
+        args: &SsimArgs,
+    ) -> CubeTensor {
+        let _span = trace_span!("photometric gradient").entered();
+        photometric::backward(rendered, target, kept, grad, args)
+    }
+
+    fn add_screen_statistics(tensors: [CubeTensor; 4], half: [f64; 2]) -> [CubeTensor; 2] {
+        screen_statistics::add(tensors, half)
     }
 
     fn adam(tensors: [CubeTensor; 4], step: &AdamStep) -> [CubeTensor; 3] {

@@ -25,8 +25,7 @@ fn activations_and_their_gradients_keep_their_digits() {
             let error = |got: f32, want: f64| (f64::from(got) / want - 1.0).abs();
             let opacity = 1.0 / (1.0 + (-x).exp());
             let slope = opacity / (1.0 + x.exp());
-            // The adapter's own exponential is an ulp worse for every unit of x.
-            let bound = if name == "Flex" { 1e-6 } else { 1e-5 };
+            let bound = 1e-6;
             assert!(
                 error(opacities[i], opacity) < bound,
                 "{name}: opacity at {x}"

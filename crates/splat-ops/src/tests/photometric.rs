@@ -22,7 +22,13 @@ const SHAPES: [[usize; 5]; 8] = [
 const WEIGHTS: [f64; 2] = [0.7, -1.3];
 
 fn args() -> SsimArgs {
-    let weights: Vec<f64> = (-5..=5).map(|i| (-f64::from(i * i) / 4.5).exp()).collect();
+    window(5, 1.5)
+}
+
+/// A window of 2 `radius` + 1.
+fn window(radius: i32, sigma: f64) -> SsimArgs {
+    let exponent = |i: i32| -0.5 * (f64::from(i) / sigma).powi(2);
+    let weights: Vec<f64> = (-radius..=radius).map(|i| exponent(i).exp()).collect();
     let total: f64 = weights.iter().sum();
     SsimArgs {
         window: weights.iter().map(|weight| weight / total).collect(),
@@ -77,23 +83,30 @@ fn outcome(rendered: Tensor<4>, measured: Photometric) -> [Vec<f64>; 3] {
         .unwrap()
 }
 
-fn fused(data: TensorData, target: impl Into<Target>, at: (&Device, DType)) -> [Vec<f64>; 3] {
+fn fused(
+    data: TensorData,
+    target: impl Into<Target>,
+    args: &SsimArgs,
+    at: (&Device, DType),
+) -> [Vec<f64>; 3] {
     let rendered = Tensor::<4>::from_data(data, at).require_grad();
-    let measured = photometric(rendered.clone(), target, &args()).unwrap();
+    let measured = photometric(rendered.clone(), target, args).unwrap();
     outcome(rendered, measured)
 }
 
 /// The same of slices, maps and means, in double precision.
-fn composed(pair: &Pair) -> [Vec<f64>; 3] {
+fn composed(pair: &Pair, args: &SsimArgs) -> [Vec<f64>; 3] {
     let device = Device::flex().autodiff();
     let at = (&device, DType::F64);
     let rendered = Tensor::<4>::from_data(pair.rendered.clone(), at).require_grad();
     let target = Tensor::<4>::from_data(pair.values.clone(), at);
     let [_, h, w, d] = target.dims();
     let image = rendered.clone().narrow(3, 0, d);
-    let mut map = ssim_map(image.clone(), target.clone(), &args()).unwrap();
-    if h >= 11 && w >= 11 {
-        map = map.narrow(1, 5, h - 10).narrow(2, 5, w - 10);
+    let mut map = ssim_map(image.clone(), target.clone(), args).unwrap();
+    let taps = args.window.len();
+    if h >= taps && w >= taps {
+        let [rows, columns] = [h, w].map(|side| side + 1 - taps);
+        map = map.narrow(1, taps / 2, rows).narrow(2, taps / 2, columns);
     }
     let measured = Photometric {
         l1: (image - target).abs().mean(),
@@ -119,25 +132,25 @@ fn check(case: &str, found: &[Vec<f64>; 3], expected: &[Vec<f64>; 3], limit: f64
 fn one_sweep_gives_what_tensors_give() {
     for shape in SHAPES {
         let pair = pair(shape);
-        let expected = composed(&pair);
+        let expected = composed(&pair, &args());
         let device = Device::flex().autodiff();
         let at = (&device, DType::F64);
         let values = Tensor::<4>::from_data(pair.values.clone(), at);
-        let found = fused(pair.rendered.clone(), values, at);
+        let found = fused(pair.rendered.clone(), values, &args(), at);
         check(&format!("double, {shape:?}"), &found, &expected, 1e-9);
 
         for (name, device) in devices() {
             let device = device.autodiff();
             let at = (&device, DType::F32);
             let values = Tensor::<4>::from_data(pair.values.clone(), at);
-            let found = fused(pair.rendered.clone(), values, at);
+            let found = fused(pair.rendered.clone(), values, &args(), at);
             check(&format!("{name}, {shape:?}"), &found, &expected, 1e-5);
             for dtype in [DType::U8, DType::I32] {
                 if !device.supports_dtype(dtype) {
                     continue;
                 }
                 let levels = Tensor::<4, Int>::from_data(pair.levels.clone(), (&device, dtype));
-                let found = fused(pair.rendered.clone(), levels, at);
+                let found = fused(pair.rendered.clone(), levels, &args(), at);
                 let case = format!("{name}, {dtype:?}, {shape:?}");
                 check(&case, &found, &expected, 1e-5);
             }
@@ -145,10 +158,34 @@ fn one_sweep_gives_what_tensors_give() {
     }
 }
 
+/// Also those that shared memory does not hold.
+#[test]
+fn windows_of_any_length_give_what_tensors_give() {
+    for radius in [0, 1, 9, 60] {
+        let args = window(radius, 1.5 + f64::from(radius) / 10.0);
+        let pair = pair([1, 40, 35, 3, 4]);
+        let expected = composed(&pair, &args);
+        for (name, device) in devices() {
+            let device = device.autodiff();
+            let at = (&device, DType::F32);
+            let levels = Tensor::<4, Int>::from_data(pair.levels.clone(), (&device, DType::I32));
+            let found = fused(pair.rendered.clone(), levels, &args, at);
+            // A window of one value alone measures no contrast: c2 / c2 up to rounding.
+            let limit = if radius == 0 { 1e-4 } else { 1e-5 };
+            check(
+                &format!("{name}, radius {radius}"),
+                &found,
+                &expected,
+                limit,
+            );
+        }
+    }
+}
+
 #[test]
 fn nothing_but_the_means_is_made_where_nothing_is_tracked() {
     let pair = pair(SHAPES[3]);
-    let expected = composed(&pair);
+    let expected = composed(&pair, &args());
     let device = Device::flex();
     let rendered = Tensor::<4>::from_data(pair.rendered, (&device, DType::F64));
     let target = Tensor::<4>::from_data(pair.values, (&device, DType::F64));
@@ -165,7 +202,7 @@ fn any_number_of_threads_gives_the_same_bits() {
         pool.build().unwrap().install(|| {
             let pair = pair([2, 150, 300, 3, 4]);
             let levels = Tensor::<4, Int>::from_data(pair.levels, (&device, DType::U8));
-            fused(pair.rendered, levels, (&device, DType::F32))
+            fused(pair.rendered, levels, &args(), (&device, DType::F32))
         })
     };
     let bits = |values: [Vec<f64>; 3]| values.map(|v| v.into_iter().map(f64::to_bits).collect());

@@ -111,7 +111,14 @@ fn colors_and_gradients_are_those_of_the_composed_ops() {
     cases.push(("Flex f64", Device::flex(), DType::F64, 1e-12));
     for (name, device, dtype, bound) in cases {
         let device = device.autodiff();
-        for (c, n, degree) in [(1, 7, 0), (1, 700, 1), (2, 65, 2), (1, 700, 3), (3, 33, 3)] {
+        for (c, n, degree) in [
+            (1, 7, 0),
+            (1, 700, 1),
+            (2, 65, 2),
+            (1, 700, 3),
+            (3, 33, 3),
+            (2, 2500, 3),
+        ] {
             let case = format!("{name}: C = {c}, N = {n}, degree {degree}");
             let leaves = Leaves::new(c, n, &device, dtype);
             let fused = leaves.results(leaves.fused(degree));
@@ -125,6 +132,21 @@ fn colors_and_gradients_are_those_of_the_composed_ops() {
                 assert!(error <= bound, "{case}: {part} differs by {error:e}");
             }
         }
+    }
+}
+
+/// A Gaussian with a broken coefficient is to be seen as broken, not as black.
+#[test]
+fn what_is_not_a_number_is_not_clamped() {
+    for (name, device) in devices() {
+        let sh0 = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -9.0, -0.0, 9.0];
+        let sh0 = Tensor::<3>::from_data(TensorData::new(sh0.to_vec(), [2, 1, 3]), &device);
+        let [means, centers] = [2, 1].map(|rows| Tensor::<2>::ones([rows, 3], &device));
+        let colors = sh_colors(sh0, None, means, centers, 0).unwrap();
+        let colors = colors.into_data().try_into_vec::<f32>().unwrap();
+        assert!(colors[0].is_nan(), "{name}: {colors:?}");
+        assert_eq!(colors[1..5], [f32::INFINITY, 0.0, 0.0, 0.5], "{name}");
+        assert!(colors[5] > 3.0, "{name}: {colors:?}");
     }
 }
 

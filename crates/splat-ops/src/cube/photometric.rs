@@ -1,0 +1,128 @@
+//! The photometric loss on CubeCL devices. The photo is read as it is stored. A window so long that its tiles do not fit
+//! into shared memory takes the way of tensor ops.
+
+use burn::backend::TensorMetadata;
+use burn::tensor::{DType, Shape};
+use burn_cubecl::CubeBackend;
+use burn_cubecl::kernel::{cast, into_contiguous};
+use burn_cubecl::tensor::CubeTensor;
+use splat_kernels::Buffer;
+use splat_kernels::photometric::{
+    Images, PhotometricShape, TargetKind, photometric, photometric_tracked, photometric_vjp,
+};
+
+use super::{buffer, prepare, tensor};
+use crate::backend::Target;
+use crate::composed;
+use crate::ssim::SsimArgs;
+
+fn shape(rendered: &CubeTensor, target: &Target<CubeBackend>, args: &SsimArgs) -> PhotometricShape {
+    let target = match target {
+        Target::Values(values) => values.shape(),
+        Target::Levels(levels) => levels.shape(),
+    };
+    PhotometricShape {
+        images: target[0],
+        height: target[1],
+        width: target[2],
+        channels: target[3],
+        pixel: rendered.shape()[3],
+        c1: args.c1 as f32,
+        c2: args.c2 as f32,
+        window: args.window.iter().map(|weight| *weight as f32).collect(),
+    }
+}
+
+/// The memory of the photo, in words of 32 bits.
+fn words(target: Target<CubeBackend>) -> (Buffer, TargetKind) {
+    let levels = match target {
+        Target::Values(values) => return (buffer(&prepare(values)), TargetKind::Values),
+        Target::Levels(levels) => levels,
+    };
+    let count = levels.shape().num_elements();
+    let (levels, words, kind) = match levels.dtype {
+        DType::U8 if count.is_multiple_of(4) => (levels, count / 4, TargetKind::Bytes),
+        DType::I32 | DType::U32 => (levels, count, TargetKind::Words),
+        _ => (cast(levels, DType::I32), count, TargetKind::Words),
+    };
+    let levels = into_contiguous(levels);
+    // As in `buffer`, a tensor that does not hold its elements would be read as empty.
+    let memory = Buffer::new(levels.handle.clone(), words);
+    let memory = memory.unwrap_or_else(|_| Buffer::empty(&levels.client, 0));
+    (memory, kind)
+}
+
+/// Means `[2]`.
+pub(super) fn measure(
+    rendered: CubeTensor,
+    target: Target<CubeBackend>,
+    args: &SsimArgs,
+) -> CubeTensor {
+    let shape = shape(&rendered, &target, args);
+    if !shape.fits(&rendered.client) {
+        return composed::photometric::<CubeBackend>(rendered, target, args);
+    }
+    let rendered = prepare(rendered);
+    let (target, kind) = words(target);
+    let images = Images {
+        rendered: &buffer(&rendered),
+        target: &target,
+        kind,
+    };
+    let means = photometric(&rendered.client, images, &shape);
+    tensor(&rendered, means, Shape::from([2]))
+}
+
+/// The same, and what the gradient needs.
+pub(super) fn measure_tracked(
+    rendered: CubeTensor,
+    target: Target<CubeBackend>,
+    args: &SsimArgs,
+) -> (CubeTensor, CubeTensor) {
+    let shape = shape(&rendered, &target, args);
+    if !shape.fits(&rendered.client) {
+        return composed::photometric_tracked::<CubeBackend>(rendered, target, args);
+    }
+    let rendered = prepare(rendered);
+    let (target, kind) = words(target);
+    let images = Images {
+        rendered: &buffer(&rendered),
+        target: &target,
+        kind,
+    };
+    let (means, kept) = photometric_tracked(&rendered.client, images, &shape);
+    let sizes = [3, shape.images, shape.channels, shape.height, shape.width];
+    (
+        tensor(&rendered, means, Shape::from([2])),
+        tensor(&rendered, kept, Shape::from(sizes)),
+    )
+}
+
+/// Gradient `[B, H, W, E]` of what was rendered.
+pub(super) fn backward(
+    rendered: CubeTensor,
+    target: Target<CubeBackend>,
+    kept: CubeTensor,
+    grad: CubeTensor,
+    args: &SsimArgs,
+) -> CubeTensor {
+    let shape = shape(&rendered, &target, args);
+    if !shape.fits(&rendered.client) {
+        return composed::photometric_backward::<CubeBackend>(rendered, target, kept, grad);
+    }
+    let [rendered, grad] = [rendered, grad].map(prepare);
+    let (target, kind) = words(target);
+    let images = Images {
+        rendered: &buffer(&rendered),
+        target: &target,
+        kind,
+    };
+    let gradient = photometric_vjp(
+        &rendered.client,
+        images,
+        &buffer(&kept),
+        &buffer(&grad),
+        &shape,
+    );
+    tensor(&rendered, gradient, rendered.shape())
+}

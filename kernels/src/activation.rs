@@ -1,0 +1,115 @@
+//! The activations of scales and opacities, element by element, and their gradients (3DGS section 5.1).
+//!
+//! ```text
+//! exp(x)                           gradient g exp(x)
+//! sigmoid(x) = 1 / (1 + exp(-x))   gradient g e / (1 + e)²,  e = exp(-|x|)
+//! ```
+//! The gradient of the logistic function is made of its argument: of its value, `y (1 - y)` is zero once y rounds to 1.
+//!
+//! Floor per element: 4 bytes read, 4 written, about 18 operations. Gradients: 8 bytes read, 4 written, and one
+//! operation, or about 20.
+
+use cubecl::prelude::*;
+
+use crate::exp::exp;
+use crate::floor::{Bytes, Sizes};
+use crate::launch::{Buffer, per_element};
+
+/// A function of one element.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Activation {
+    /// `exp(x)`.
+    Exp,
+    /// `1 / (1 + exp(-x))`.
+    Sigmoid,
+}
+
+/// What the three scales and the opacity of each Gaussian, and their gradients, must move.
+pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
+    let values = 4 * sizes.gaussians;
+    [
+        Bytes {
+            read: 4 * values,
+            written: 4 * values,
+        },
+        Bytes {
+            read: 8 * values,
+            written: 4 * values,
+        },
+    ]
+}
+
+#[cube(launch)]
+fn activate_each(x: &[f32], y: &mut [f32], len: u32, #[comptime] function: Activation) {
+    let i = ABSOLUTE_POS;
+    if i < len as usize {
+        if comptime!(function == Activation::Exp) {
+            y[i] = exp(x[i]);
+        } else {
+            // exp(min(x, 0)) / (1 + exp(-|x|)): one exponential is 1 or the other.
+            let small = exp(-f32::abs(x[i]));
+            let above = select(x[i] < 0.0f32, small, 1.0f32);
+            y[i] = above / (1.0f32 + small);
+        }
+    }
+}
+
+/// The function of every element, in the memory of `x` if nothing else holds it.
+pub fn activate(client: &Client, x: Buffer, function: Activation) -> Buffer {
+    let len = x.len();
+    let (y, [input, output]) = x.overwritten(client, 0);
+    if let Some((count, dim)) = per_element(len) {
+        activate_each::launch(client, count, dim, input, output, len as u32, function);
+    }
+    y
+}
+
+/// `known`: what came out of the exponential, what went into the logistic function.
+#[cube(launch)]
+fn activate_each_vjp(
+    known: &[f32],
+    grad: &[f32],
+    out: &mut [f32],
+    len: u32,
+    #[comptime] function: Activation,
+) {
+    let i = ABSOLUTE_POS;
+    if i < len as usize {
+        if comptime!(function == Activation::Exp) {
+            out[i] = grad[i] * known[i];
+        } else {
+            let small = exp(-f32::abs(known[i]));
+            let one = 1.0f32 + small;
+            out[i] = grad[i] * (small / one / one);
+        }
+    }
+}
+
+/// Gradient of the argument `x` of [`activate`], given its value `y` and the gradient of that, in whose memory it is
+/// written if nothing else holds it.
+pub fn activate_vjp(
+    client: &Client,
+    [x, y]: [&Buffer; 2],
+    grad: Buffer,
+    function: Activation,
+) -> Buffer {
+    let known = match function {
+        Activation::Exp => y,
+        Activation::Sigmoid => x,
+    };
+    let len = grad.len().min(known.len());
+    let (out, [input, output]) = grad.overwritten(client, 1);
+    if let Some((count, dim)) = per_element(len) {
+        activate_each_vjp::launch(
+            client,
+            count,
+            dim,
+            known.arg(),
+            input,
+            output,
+            len as u32,
+            function,
+        );
+    }
+    out
+}

@@ -1,0 +1,399 @@
+//! Colours of Gaussians in the directions of the cameras, and the vector-Jacobian product (3DGS section 4).
+//!
+//! ```text
+//! colour = max(Σ_k Y_k(d / |d|) coefficient_k + 1/2, 0),   d = mean - centre
+//! ```
+//! A channel below zero takes no gradient, one that is exactly zero does. Directions are made where they are used.
+//! Gradients of Gaussians are summed over cameras inside one unit; those of the centres by blocks of Gaussians and then
+//! over the blocks, in order: no atomics.
+//!
+//! Floor per Gaussian, with K = `(degree + 1)²`: 12 bytes of mean and 12 K of coefficients read; for every camera 12
+//! written and about 9 K + 25 operations. Gradients: 12 + 12 K read and for every camera 12; 12 + 12 K written; for
+//! every camera about 24 K + 40 operations. Gradients of centres, if wanted, read and compute that once more.
+
+use cubecl::prelude::*;
+
+use crate::floor::{Bytes, Sizes};
+use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
+use crate::math::{Vec3, is_below_zero};
+use crate::reduce::{sum_blocks, sum_units};
+use crate::sh::{basis, direction_vjp, functions, guarded_dot, inverse_length, usable_degree};
+
+/// Gaussians that one unit of the centres' gradient sums.
+const CENTER_ITEMS: usize = 4;
+/// Gaussians that one workgroup of it sums.
+const CENTER_BLOCK: usize = CUBE_UNITS_USIZE * CENTER_ITEMS;
+
+/// What forward and gradient must move for one camera.
+pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
+    let n = sizes.gaussians;
+    let coefficients = 12 * functions(sizes.degree) as u64;
+    [
+        Bytes {
+            read: (12 + coefficients) * n,
+            written: 12 * n,
+        },
+        Bytes {
+            read: (24 + coefficients) * n,
+            written: (12 + coefficients) * n,
+        },
+    ]
+}
+
+/// What the colours are made of.
+#[derive(Clone, Debug)]
+pub struct ShInputs {
+    /// Coefficients of degree 0 [N, 1, 3].
+    pub sh0: Buffer,
+    /// Those of the higher degrees [N, R, 3], if there are any.
+    pub sh_rest: Option<Buffer>,
+    /// R.
+    pub stored: usize,
+    /// World positions [N, 3].
+    pub means: Buffer,
+    /// Where the cameras stand [C, 3].
+    pub centers: Buffer,
+}
+
+impl ShInputs {
+    fn gaussians(&self) -> usize {
+        let rest = self.sh_rest.as_ref().filter(|_| self.stored > 0);
+        (self.means.len() / 3)
+            .min(self.sh0.len() / 3)
+            .min(rest.map_or(usize::MAX, |rest| rest.len() / (3 * self.stored)))
+    }
+
+    fn cameras(&self) -> usize {
+        self.centers.len() / 3
+    }
+
+    fn degree(&self, degree: usize) -> usize {
+        let stored = self.sh_rest.as_ref().map_or(0, |_| self.stored);
+        usable_degree(degree, 1 + stored)
+    }
+
+    /// Something to bind in place of coefficients that are not read.
+    fn rest(&self) -> &Buffer {
+        self.sh_rest.as_ref().unwrap_or(&self.sh0)
+    }
+}
+
+/// A Gaussian as a camera sees it: d / |d| and 1 / |d|.
+#[derive(CubeType, Clone, Copy)]
+#[expand(derive(Clone, Copy))]
+struct Sight {
+    unit: Vec3,
+    inverse: f32,
+}
+
+#[cube]
+fn sight(means: &[f32], centers: &[f32], gaussian: usize, camera: usize) -> Sight {
+    let d = Vec3::load(means, gaussian * 3).sub(Vec3::load(centers, camera * 3));
+    let inverse = inverse_length(d);
+    Sight {
+        unit: d.scale(inverse),
+        inverse,
+    }
+}
+
+/// The colour before the clamp. Fused multiply-adds are spelled out, so that the gradient finds the same sign.
+#[cube]
+fn unclamped(
+    sh0: &[f32],
+    rest: &[f32],
+    y: &Array<f32>,
+    gaussian: usize,
+    stored: usize,
+    #[comptime] degree: usize,
+) -> Vec3 {
+    let first = Vec3::load(sh0, gaussian * 3).scale(y[0]);
+    let mut red = first.x;
+    let mut green = first.y;
+    let mut blue = first.z;
+    let from = gaussian * stored * 3;
+    #[unroll]
+    for k in 1..comptime!(functions(degree)) {
+        let coefficient = Vec3::load(rest, from + (k - 1) * 3);
+        red = fma(y[k], coefficient.x, red);
+        green = fma(y[k], coefficient.y, green);
+        blue = fma(y[k], coefficient.z, blue);
+    }
+    Vec3::new(red + 0.5f32, green + 0.5f32, blue + 0.5f32)
+}
+
+/// Zero below zero; NaN stays.
+#[cube]
+fn clamped(value: f32) -> f32 {
+    select(is_below_zero(value), 0.0f32, value)
+}
+
+#[cube(launch)]
+fn sh_colors_forward(
+    sh0: &[f32],
+    rest: &[f32],
+    means: &[f32],
+    centers: &[f32],
+    colors: &mut [f32],
+    gaussians: u32,
+    cameras: u32,
+    stored: u32,
+    #[comptime] degree: usize,
+) {
+    let gaussians = gaussians as usize;
+    let index = ABSOLUTE_POS;
+    if index < gaussians * cameras as usize {
+        let gaussian = index % gaussians;
+        let sight = sight(means, centers, gaussian, index / gaussians);
+        let mut y = Array::<f32>::new(comptime!(functions(degree)));
+        basis(sight.unit, &mut y, degree);
+        let color = unclamped(sh0, rest, &y, gaussian, stored as usize, degree);
+        Vec3::new(clamped(color.x), clamped(color.y), clamped(color.z)).store(colors, index * 3);
+    }
+}
+
+/// Colours [C, N, 3]. `degree` is cut to [`crate::sh::MAX_DEGREE`] and to what is stored.
+pub fn sh_colors(client: &Client, inputs: &ShInputs, degree: usize) -> Buffer {
+    let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
+    let colors = Buffer::empty(client, cameras * gaussians * 3);
+    if let Some((count, dim)) = per_element(cameras * gaussians) {
+        sh_colors_forward::launch(
+            client,
+            count,
+            dim,
+            inputs.sh0.arg(),
+            inputs.rest().arg(),
+            inputs.means.arg(),
+            inputs.centers.arg(),
+            colors.arg(),
+            gaussians as u32,
+            cameras as u32,
+            inputs.stored as u32,
+            inputs.degree(degree),
+        );
+    }
+    colors
+}
+
+/// The gradient of a colour, without the channels that are clamped.
+#[cube]
+fn passed_on(color: Vec3, g: Vec3) -> Vec3 {
+    Vec3::new(
+        select(is_below_zero(color.x), 0.0f32, g.x),
+        select(is_below_zero(color.y), 0.0f32, g.y),
+        select(is_below_zero(color.z), 0.0f32, g.z),
+    )
+}
+
+/// The gradient of the direction, given that of the colour before the clamp.
+#[cube]
+fn sight_vjp(
+    rest: &[f32],
+    sight: Sight,
+    g: Vec3,
+    gaussian: usize,
+    stored: usize,
+    #[comptime] degree: usize,
+) -> Vec3 {
+    let mut weights = Array::<f32>::new(comptime!(functions(degree)));
+    // The function of degree 0 does not look at the direction.
+    weights[0] = 0.0f32;
+    let from = gaussian * stored * 3;
+    #[unroll]
+    for k in 1..comptime!(functions(degree)) {
+        weights[k] = guarded_dot(g, Vec3::load(rest, from + (k - 1) * 3));
+    }
+    direction_vjp(sight.unit, sight.inverse, &weights, degree)
+}
+
+/// Gradients of Gaussians, summed over cameras; zero for coefficients that are not read.
+#[cube(launch)]
+fn sh_colors_backward_gaussians(
+    sh0: &[f32],
+    rest: &[f32],
+    means: &[f32],
+    centers: &[f32],
+    grad_colors: &[f32],
+    grad_sh0: &mut [f32],
+    grad_rest: &mut [f32],
+    grad_means: &mut [f32],
+    gaussians: u32,
+    cameras: u32,
+    stored: u32,
+    #[comptime] degree: usize,
+    #[comptime] wanted: [bool; 3],
+) {
+    let gaussians = gaussians as usize;
+    let stored = stored as usize;
+    let gaussian = ABSOLUTE_POS;
+    if gaussian < gaussians {
+        let mut y = Array::<f32>::new(comptime!(functions(degree)));
+        let mut sums = Array::<f32>::new(comptime!(3 * functions(degree)));
+        #[unroll]
+        for k in 0..comptime!(3 * functions(degree)) {
+            sums[k] = 0.0f32;
+        }
+        let mut mean_x = 0.0f32;
+        let mut mean_y = 0.0f32;
+        let mut mean_z = 0.0f32;
+        for camera in 0..cameras as usize {
+            let g = Vec3::load(grad_colors, (camera * gaussians + gaussian) * 3);
+            // Of a splat that is not seen nothing is evaluated: were it NaN, zero times it would be too.
+            if g.max_abs() != 0.0f32 {
+                let sight = sight(means, centers, gaussian, camera);
+                basis(sight.unit, &mut y, degree);
+                let color = unclamped(sh0, rest, &y, gaussian, stored, degree);
+                let g = passed_on(color, g);
+                if comptime!(wanted[0] || wanted[1]) {
+                    #[unroll]
+                    for k in 0..comptime!(functions(degree)) {
+                        sums[k * 3] += y[k] * g.x;
+                        sums[k * 3 + 1] += y[k] * g.y;
+                        sums[k * 3 + 2] += y[k] * g.z;
+                    }
+                }
+                if comptime!(wanted[2]) {
+                    let grad = sight_vjp(rest, sight, g, gaussian, stored, degree);
+                    mean_x += grad.x;
+                    mean_y += grad.y;
+                    mean_z += grad.z;
+                }
+            }
+        }
+        if comptime!(wanted[0]) {
+            Vec3::new(sums[0], sums[1], sums[2]).store(grad_sh0, gaussian * 3);
+        }
+        if comptime!(wanted[1]) {
+            let to = gaussian * stored * 3;
+            #[unroll]
+            for k in 3..comptime!(3 * functions(degree)) {
+                grad_rest[to + k - 3] = sums[k];
+            }
+            for k in comptime!(3 * functions(degree) - 3)..stored * 3 {
+                grad_rest[to + k] = 0.0f32;
+            }
+        }
+        if comptime!(wanted[2]) {
+            Vec3::new(mean_x, mean_y, mean_z).store(grad_means, gaussian * 3);
+        }
+    }
+}
+
+/// Gradients of centres: `partials[camera, block]` = sum over the Gaussians of the block.
+#[cube(launch)]
+fn sh_colors_backward_centers(
+    sh0: &[f32],
+    rest: &[f32],
+    means: &[f32],
+    centers: &[f32],
+    grad_colors: &[f32],
+    partials: &mut [f32],
+    gaussians: u32,
+    cameras: u32,
+    blocks: u32,
+    stored: u32,
+    #[comptime] degree: usize,
+) {
+    let mut shared = Shared::new_slice(CUBE_UNITS_USIZE);
+    let gaussians = gaussians as usize;
+    let stored = stored as usize;
+    let camera = CUBE_POS / blocks as usize;
+    let block = CUBE_POS % blocks as usize;
+    let mut x = 0.0f32;
+    let mut y = 0.0f32;
+    let mut z = 0.0f32;
+    if camera < cameras as usize {
+        for item in 0..CENTER_ITEMS {
+            let gaussian = block * CENTER_BLOCK + item * CUBE_UNITS_USIZE + UNIT_POS as usize;
+            if gaussian < gaussians {
+                let g = Vec3::load(grad_colors, (camera * gaussians + gaussian) * 3);
+                // As above: what is broken and not seen must not reach the camera.
+                if g.max_abs() != 0.0f32 {
+                    let sight = sight(means, centers, gaussian, camera);
+                    let mut values = Array::<f32>::new(comptime!(functions(degree)));
+                    basis(sight.unit, &mut values, degree);
+                    let color = unclamped(sh0, rest, &values, gaussian, stored, degree);
+                    let g = passed_on(color, g);
+                    let grad = sight_vjp(rest, sight, g, gaussian, stored, degree);
+                    x -= grad.x;
+                    y -= grad.y;
+                    z -= grad.z;
+                }
+            }
+        }
+    }
+    let x = sum_units(&mut shared, x, CUBE_UNITS_USIZE);
+    let y = sum_units(&mut shared, y, CUBE_UNITS_USIZE);
+    let z = sum_units(&mut shared, z, CUBE_UNITS_USIZE);
+    if UNIT_POS == 0 && camera < cameras as usize {
+        Vec3::new(x, y, z).store(partials, CUBE_POS * 3);
+    }
+}
+
+/// Gradients of sh0 [N, 1, 3], `sh_rest` [N, R, 3], means [N, 3] and centres [C, 3] for that of the colours [C, N, 3];
+/// only those `wanted`.
+pub fn sh_colors_backward(
+    client: &Client,
+    inputs: &ShInputs,
+    grad_colors: &Buffer,
+    degree: usize,
+    wanted: [bool; 4],
+) -> [Option<Buffer>; 4] {
+    let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
+    let degree = inputs.degree(degree);
+    let lens = [gaussians * 3, gaussians * inputs.stored * 3, gaussians * 3];
+    // An unwanted gradient still needs something to bind.
+    let grads: [Buffer; 3] =
+        std::array::from_fn(|i| Buffer::empty(client, if wanted[i] { lens[i] } else { 1 }));
+    if wanted[..3].contains(&true)
+        && let Some((count, dim)) = per_element(gaussians)
+    {
+        sh_colors_backward_gaussians::launch(
+            client,
+            count,
+            dim,
+            inputs.sh0.arg(),
+            inputs.rest().arg(),
+            inputs.means.arg(),
+            inputs.centers.arg(),
+            grad_colors.arg(),
+            grads[0].arg(),
+            grads[1].arg(),
+            grads[2].arg(),
+            gaussians as u32,
+            cameras as u32,
+            inputs.stored as u32,
+            degree,
+            [wanted[0], wanted[1], wanted[2]],
+        );
+    }
+    let of_centers = wanted[3].then(|| {
+        let blocks = gaussians.div_ceil(CENTER_BLOCK);
+        let partials = Buffer::empty(client, cameras * blocks * 3);
+        if !partials.is_empty() {
+            sh_colors_backward_centers::launch(
+                client,
+                cube_count(cameras * blocks),
+                CubeDim::new_1d(CUBE_UNITS),
+                inputs.sh0.arg(),
+                inputs.rest().arg(),
+                inputs.means.arg(),
+                inputs.centers.arg(),
+                grad_colors.arg(),
+                partials.arg(),
+                gaussians as u32,
+                cameras as u32,
+                blocks as u32,
+                inputs.stored as u32,
+                degree,
+            );
+        }
+        sum_blocks(client, &partials, [cameras, blocks, 3])
+    });
+    let [sh0, sh_rest, means] = grads;
+    [
+        wanted[0].then_some(sh0),
+        wanted[1].then_some(sh_rest),
+        wanted[2].then_some(means),
+        of_centers,
+    ]
+}
