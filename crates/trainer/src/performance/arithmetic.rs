@@ -123,7 +123,7 @@ mod tests {
 
     #[test]
     fn every_pixel_blends_every_splat() {
-        let [packed, colors, opacities] = splats(&Device::flex());
+        let [packed, colors, opacities] = splats(&Device::flex().autodiff());
         let size = ImageSize {
             width: TILE,
             height: TILE,
