@@ -66,6 +66,8 @@ fn means<T: Real>(pictures: &Pictures, args: &SsimArgs, slope: Option<&mut [T]>)
     }
     let sums: Vec<[f64; 2]> = bands
         .into_par_iter()
+        // Or else the last bands would often be worked on by one thread alone.
+        .with_max_len(1)
         .map_init(Scratch::default, |scratch, band| {
             sweep.band(band.image, band.rows, band.slope, scratch)
         })

@@ -40,6 +40,10 @@ use splat::{AHEAD, Splat};
 
 pub use work::{RasterizeWork, rasterize_work};
 
+/// Rows of tiles that a thread takes at once. Of more, which the scheduler would make it take, the last ones are often
+/// worked on alone.
+const ROWS_AT_ONCE: usize = 1;
+
 /// What the forward keeps for the backward: a [`Frame`] per camera, none of an image that was not rendered.
 #[derive(Debug, Clone)]
 pub struct State(Arc<dyn Any + Send + Sync>);
@@ -260,6 +264,7 @@ fn blend<T: Real>(
         .zip(transmittance.par_chunks_mut(slab))
         .zip(stop.par_chunks_mut(slab))
         .enumerate()
+        .with_max_len(ROWS_AT_ONCE)
         .map(|(ty, ((image, transmittance), stop))| {
             let slab = Slab {
                 image,
@@ -344,6 +349,7 @@ pub(super) fn backward<T: Real>(
         let backgrounds: Vec<Vec<T>> = slabs
             .into_par_iter()
             .enumerate()
+            .with_max_len(ROWS_AT_ONCE)
             .map(|(ty, partials)| {
                 row_of_tiles_backward(&view, &frame.blocks[ty], &upstream, ty, partials)
             })
