@@ -54,9 +54,8 @@ for capture in "${captures[@]}"; do
 done
 [[ $downscale =~ ^[1-9][0-9]*$ ]] || fail "--downscale must be a whole number from 1"
 case "$device" in
-    # SPIR-V is how wgpu compiles for Vulkan when the feature is built in; cuda is a device of its own.
     wgpu) features=() runs_on=wgpu ;;
-    vulkan) features=(--features vulkan) runs_on=wgpu ;;
+    vulkan) features=(--features vulkan) runs_on=vulkan ;;
     cuda) features=(--features cuda) runs_on=cuda ;;
     *) fail "--device must be wgpu, vulkan or cuda" ;;
 esac

@@ -16,7 +16,9 @@ pub enum DeviceChoice {
     Cpu,
     /// Vulkan, Metal, DirectX or WebGPU, software adapters included
     Wgpu,
-    /// CUDA
+    /// The same through SPIR-V, faster on GPUs with Vulkan; in a program built with the feature `vulkan`
+    Vulkan,
+    /// CUDA; in a program built with the feature `cuda`
     Cuda,
 }
 
@@ -28,6 +30,7 @@ impl DeviceChoice {
             Self::Auto => "auto",
             Self::Cpu => "cpu",
             Self::Wgpu => "wgpu",
+            Self::Vulkan => "vulkan",
             Self::Cuda => "cuda",
         }
     }
@@ -54,11 +57,12 @@ impl ChosenDevice {
 pub(super) fn open(global: &GlobalArgs) -> Result<ChosenDevice, Failure> {
     let chosen = match global.device {
         DeviceChoice::Cpu => cpu(),
-        DeviceChoice::Wgpu => wgpu(),
+        DeviceChoice::Wgpu => wgpu("wgpu"),
+        DeviceChoice::Vulkan => vulkan(),
         DeviceChoice::Cuda => cuda(),
         DeviceChoice::Auto => cuda()
             .or_else(|_| real_gpu().ok_or(()))
-            .or_else(|()| cpu().or_else(|_| wgpu())),
+            .or_else(|()| cpu().or_else(|_| wgpu("wgpu"))),
     }?;
     global.say(format_args!("device: {}", chosen.in_words()));
     Ok(chosen)
@@ -99,17 +103,28 @@ fn real_gpu() -> Option<ChosenDevice> {
 }
 
 #[cfg(feature = "wgpu")]
-fn wgpu() -> Result<ChosenDevice, Failure> {
+fn wgpu(api: &str) -> Result<ChosenDevice, Failure> {
     let device = Device::wgpu_options().init();
     let device = device.map_err(|error| {
-        Failure::BadInput(format!("--device wgpu: no adapter can be used: {error}"))
+        Failure::BadInput(format!("--device {api}: no adapter can be used: {error}"))
     })?;
-    Ok(named("wgpu", device))
+    Ok(named(api, device))
 }
 
 #[cfg(not(feature = "wgpu"))]
-fn wgpu() -> Result<ChosenDevice, Failure> {
+fn wgpu(_: &str) -> Result<ChosenDevice, Failure> {
     Err(not_built("wgpu"))
+}
+
+/// With the feature, wgpu compiles to SPIR-V wherever the adapter takes it.
+#[cfg(feature = "vulkan")]
+fn vulkan() -> Result<ChosenDevice, Failure> {
+    wgpu("vulkan")
+}
+
+#[cfg(not(feature = "vulkan"))]
+fn vulkan() -> Result<ChosenDevice, Failure> {
+    Err(not_built("vulkan"))
 }
 
 #[cfg(feature = "cuda")]
@@ -134,7 +149,7 @@ fn named(api: &str, device: Device) -> ChosenDevice {
     ChosenDevice { device, name }
 }
 
-#[cfg(not(all(feature = "cpu", feature = "wgpu", feature = "cuda")))]
+#[cfg(not(all(feature = "cpu", feature = "vulkan", feature = "cuda")))]
 fn not_built(feature: &str) -> Failure {
     Failure::BadInput(format!(
         "--device {feature}: this program was built without it; build with `--features {feature}`"

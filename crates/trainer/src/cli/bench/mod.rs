@@ -68,7 +68,9 @@ fn write_svg(path: &Path, svg: Result<String, String>) -> Result<(), Failure> {
 fn chosen(global: &GlobalArgs) -> Result<Device, Failure> {
     match global.device {
         DeviceChoice::Auto | DeviceChoice::Cpu => Ok(Device::flex()),
-        DeviceChoice::Wgpu | DeviceChoice::Cuda => Ok(device::open(global)?.device),
+        DeviceChoice::Wgpu | DeviceChoice::Vulkan | DeviceChoice::Cuda => {
+            Ok(device::open(global)?.device)
+        }
     }
 }
 
@@ -76,7 +78,7 @@ fn chosen(global: &GlobalArgs) -> Result<Device, Failure> {
 fn cpu_only(global: &GlobalArgs) -> Result<(), Failure> {
     match global.device {
         DeviceChoice::Auto | DeviceChoice::Cpu => Ok(()),
-        DeviceChoice::Wgpu | DeviceChoice::Cuda => Err(Failure::BadInput(
+        DeviceChoice::Wgpu | DeviceChoice::Vulkan | DeviceChoice::Cuda => Err(Failure::BadInput(
             "--device: this page is about the CPU; step, rasterize and scaling take a device each"
                 .to_owned(),
         )),
