@@ -7,7 +7,6 @@ mod poison;
 mod probe;
 mod screen_statistics;
 mod sh_colors;
-mod times;
 
 use burn::tensor::Device;
 

@@ -1,15 +1,28 @@
-//! What the ops of a training step take, op by op. Measurements, not checks: run them by name with
-//! `--ignored --nocapture`, alone.
+//! What the ops of a training step take with their gradients, op by op, on the CPU and on the default wgpu adapter:
+//! `cargo bench -p splat-ops --bench ops`.
 
 use burn::tensor::{DType, Device, Int, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
-
-use super::devices;
-use crate::{
+use splat_ops::device::kernel_work;
+use splat_ops::{
     ImageSize, ProjectSettings, RasterizeSettings, ScreenStatistics, SsimArgs, exp, photometric,
     project, rasterize, sh_colors, sigmoid,
 };
+
+fn main() {
+    time_of_the_ops_beside_project_and_rasterize();
+    time_of_rasterize_by_channels();
+}
+
+fn devices() -> Vec<(&'static str, Device)> {
+    let mut devices = vec![("Flex", Device::flex())];
+    match Device::wgpu_options().init() {
+        Ok(device) => devices.push(("wgpu", device)),
+        Err(error) => eprintln!("no wgpu adapter is measured: {error}"),
+    }
+    devices
+}
 
 const ROUNDS: u32 = 10;
 
@@ -29,13 +42,7 @@ fn measure(name: &str, device: &Device, mut run: impl FnMut()) {
     run();
     run();
     device.sync().unwrap();
-    let launches = || {
-        #[cfg(feature = "cube")]
-        return splat_kernels::work().launches;
-        #[cfg(not(feature = "cube"))]
-        return 0;
-    };
-    let (before, user, start) = (launches(), user_time(), std::time::Instant::now());
+    let (before, user, start) = (kernel_work(), user_time(), std::time::Instant::now());
     for _ in 0..ROUNDS {
         run();
     }
@@ -45,7 +52,7 @@ fn measure(name: &str, device: &Device, mut run: impl FnMut()) {
         "{name:34} {:8.2} ms, user {:8.2} ms, launches of splat-kernels {}",
         1e3 * start.elapsed().as_secs_f64() / each,
         1e3 * (user_time() - user) / each,
-        (launches() - before) / u64::from(ROUNDS)
+        kernel_work().since(before).launches / u64::from(ROUNDS)
     );
 }
 
@@ -63,8 +70,6 @@ impl Random {
     }
 }
 
-#[test]
-#[ignore = "a measurement, not a check"]
 fn time_of_the_ops_beside_project_and_rasterize() {
     let n = 100_000;
     let [h, w] = [480, 270];
@@ -142,8 +147,6 @@ fn time_of_the_ops_beside_project_and_rasterize() {
     }
 }
 
-#[test]
-#[ignore = "a measurement, not a check"]
 fn time_of_rasterize_by_channels() {
     let n = 15_000;
     let size = ImageSize {
