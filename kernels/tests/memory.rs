@@ -1,27 +1,15 @@
 //! Memory, by the allocator's own count, and its bandwidth: in a process of its own, because the count is of all.
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+#[path = "kernels/adapter.rs"]
+mod adapter;
+#[path = "kernels/alone.rs"]
+mod alone;
 
+use alone::alone;
 use cubecl::MemoryScope;
-use cubecl::client::Client;
-use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
 use splat_kernels::intersect::Frames;
 use splat_kernels::rasterize::{Kept, RasterizeInputs, RasterizeSettings, rasterize};
 use splat_kernels::{Buffer, copy};
-
-static ALONE: Mutex<()> = Mutex::new(());
-
-fn alone() -> Option<(MutexGuard<'static, ()>, Client)> {
-    let guard = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
-    let device = [DefaultDevice, Cpu]
-        .into_iter()
-        .find_map(|kind| cubecl::Device::wgpu(kind).ok());
-    let Some(device) = device else {
-        eprintln!("\n*** SKIPPED: no wgpu adapter on this machine ***\n");
-        return None;
-    };
-    Some((guard, device.client()))
-}
 
 #[test]
 fn a_picture_keeps_the_bytes_that_are_stated() {

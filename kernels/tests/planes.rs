@@ -1,5 +1,7 @@
 //! The kernels that use plane operations, by the tests of `kernels/`. A process of its own: the choice is for all.
 
+#[path = "kernels/adapter.rs"]
+mod adapter;
 #[path = "kernels/device.rs"]
 mod device;
 #[path = "kernels/rasterize.rs"]

@@ -1,28 +1,17 @@
 //! What is counted for the whole process, and what depends on calls before: alone in its process, one after the other.
 
-use std::sync::{Mutex, MutexGuard, PoisonError};
+#[path = "kernels/adapter.rs"]
+mod adapter;
+#[path = "kernels/alone.rs"]
+mod alone;
 
+use alone::alone;
 use cubecl::client::Client;
-use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
 use splat_kernels::activation::{Activation, activate};
 use splat_kernels::intersect::Frames;
 use splat_kernels::rasterize::{RasterizeInputs, RasterizeSettings, rasterize};
 use splat_kernels::screen_statistics::screen_statistics;
 use splat_kernels::{Buffer, Work, scan, work};
-
-static ALONE: Mutex<()> = Mutex::new(());
-
-fn alone() -> Option<(MutexGuard<'static, ()>, Client)> {
-    let guard = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
-    let device = [DefaultDevice, Cpu]
-        .into_iter()
-        .find_map(|kind| cubecl::Device::wgpu(kind).ok());
-    let Some(device) = device else {
-        eprintln!("\n*** SKIPPED: no wgpu adapter on this machine ***\n");
-        return None;
-    };
-    Some((guard, device.client()))
-}
 
 #[test]
 fn launches_bytes_and_waits_are_counted() {

@@ -8,15 +8,7 @@ use splat_kernels::Buffer;
 /// A client of the default wgpu adapter, software ones included, of which kernels take the way that this test program is
 /// about: with planes or without. `None`, loudly, where there is no adapter.
 pub fn client() -> Option<Client> {
-    use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
-    let found = [DefaultDevice, Cpu]
-        .into_iter()
-        .find_map(|kind| cubecl::Device::wgpu(kind).ok());
-    let Some(device) = found else {
-        eprintln!("\n*** SKIPPED: no wgpu adapter here, the kernels were NOT tested ***\n");
-        return None;
-    };
-    let client = device.client();
+    let client = crate::adapter::find()?;
     splat_kernels::force_plane_size(Some(0));
     if crate::PLANES {
         // Software devices are not asked whether they have planes, but may.

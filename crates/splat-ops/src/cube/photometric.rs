@@ -33,6 +33,35 @@ fn shape(rendered: &CubeTensor, target: &Target<CubeBackend>, args: &SsimArgs) -
     }
 }
 
+/// Both images, in memory as the kernels read it.
+struct Pictures {
+    rendered: CubeTensor,
+    values: Buffer,
+    target: Buffer,
+    kind: TargetKind,
+}
+
+impl Pictures {
+    fn new(rendered: CubeTensor, target: Target<CubeBackend>) -> Self {
+        let rendered = prepare(rendered);
+        let (target, kind) = words(target);
+        Self {
+            values: buffer(&rendered),
+            rendered,
+            target,
+            kind,
+        }
+    }
+
+    fn images(&self) -> Images<'_> {
+        Images {
+            rendered: &self.values,
+            target: &self.target,
+            kind: self.kind,
+        }
+    }
+}
+
 /// The memory of the photo, in words of 32 bits.
 fn words(target: Target<CubeBackend>) -> (Buffer, TargetKind) {
     let levels = match target {
@@ -62,15 +91,10 @@ pub(super) fn measure(
     if !shape.fits(&rendered.client) {
         return composed::photometric::<CubeBackend>(rendered, target, args);
     }
-    let rendered = prepare(rendered);
-    let (target, kind) = words(target);
-    let images = Images {
-        rendered: &buffer(&rendered),
-        target: &target,
-        kind,
-    };
-    let means = photometric(&rendered.client, images, &shape);
-    tensor(&rendered, means, Shape::from([2]))
+    let pictures = Pictures::new(rendered, target);
+    let rendered = &pictures.rendered;
+    let means = photometric(&rendered.client, pictures.images(), &shape);
+    tensor(rendered, means, Shape::from([2]))
 }
 
 /// The same, and what the gradient needs.
@@ -83,18 +107,13 @@ pub(super) fn measure_tracked(
     if !shape.fits(&rendered.client) {
         return composed::photometric_tracked::<CubeBackend>(rendered, target, args);
     }
-    let rendered = prepare(rendered);
-    let (target, kind) = words(target);
-    let images = Images {
-        rendered: &buffer(&rendered),
-        target: &target,
-        kind,
-    };
-    let (means, kept) = photometric_tracked(&rendered.client, images, &shape);
+    let pictures = Pictures::new(rendered, target);
+    let rendered = &pictures.rendered;
+    let (means, kept) = photometric_tracked(&rendered.client, pictures.images(), &shape);
     let sizes = [3, shape.images, shape.channels, shape.height, shape.width];
     (
-        tensor(&rendered, means, Shape::from([2])),
-        tensor(&rendered, kept, Shape::from(sizes)),
+        tensor(rendered, means, Shape::from([2])),
+        tensor(rendered, kept, Shape::from(sizes)),
     )
 }
 
@@ -110,19 +129,15 @@ pub(super) fn backward(
     if !shape.fits(&rendered.client) {
         return composed::photometric_backward::<CubeBackend>(rendered, target, kept, grad);
     }
-    let [rendered, grad] = [rendered, grad].map(prepare);
-    let (target, kind) = words(target);
-    let images = Images {
-        rendered: &buffer(&rendered),
-        target: &target,
-        kind,
-    };
+    let pictures = Pictures::new(rendered, target);
+    let rendered = &pictures.rendered;
+    let grad = prepare(grad);
     let gradient = photometric_vjp(
         &rendered.client,
-        images,
+        pictures.images(),
         &buffer(&kept),
         &buffer(&grad),
         &shape,
     );
-    tensor(&rendered, gradient, rendered.shape())
+    tensor(rendered, gradient, rendered.shape())
 }

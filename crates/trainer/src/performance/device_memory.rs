@@ -10,8 +10,15 @@ use serde::{Deserialize, Serialize};
 use super::PerformanceError;
 use crate::Trainer;
 
+/// Floats of a Gaussian that are trained: mean, scale, rotation, opacity, colour; and the coefficients of the higher
+/// degrees, all of them as soon as one is evaluated.
+pub(super) const fn parameters(sh_degree: usize) -> u64 {
+    let higher = if sh_degree == 0 { 0 } else { 45 };
+    3 + 3 + 4 + 1 + 3 + higher
+}
+
 /// Bytes of a Gaussian of degree 3 between steps.
-pub const PER_GAUSSIAN_AT_REST: u64 = 4 * (59 + 2 * 59 + 2);
+pub const PER_GAUSSIAN_AT_REST: u64 = 4 * (3 * parameters(3) + 2);
 /// What they shall not exceed: a million in 1.2 GB.
 pub const PER_GAUSSIAN_GOAL: u64 = 1200;
 

@@ -9,7 +9,9 @@ use burn::tensor::Device;
 use serde::Serialize;
 use splat_ops::device::{StepSizes, copy_bandwidth, describe, kernel_work, step_floor};
 
-use super::device_memory::{DeviceMemory, PER_GAUSSIAN_AT_REST, PER_GAUSSIAN_GOAL, in_use};
+use super::device_memory::{
+    DeviceMemory, PER_GAUSSIAN_AT_REST, PER_GAUSSIAN_GOAL, in_use, parameters,
+};
 use super::stages::Recording;
 use super::step::{Samples, StageColumn, at_degree, trainer, work_on, write_stages};
 use super::{Machine, PerformanceError, Spread, Work};
@@ -24,13 +26,6 @@ const LEAST: usize = 3;
 const COPY_BYTES: usize = 256 << 20;
 /// The same on a device that is a processor, whose caches are smaller and whose time is short.
 const SOFTWARE_COPY_BYTES: usize = 64 << 20;
-
-/// Floats of a Gaussian that are trained: mean, scale, rotation, opacity, colour; and the coefficients of the higher
-/// degrees, all of them as soon as one is evaluated.
-fn parameters(sh_degree: usize) -> u64 {
-    let higher = if sh_degree == 0 { 0 } else { 45 };
-    3 + 3 + 4 + 1 + 3 + higher
-}
 
 /// The training step of a capture's first Gaussians on a device.
 #[derive(Debug, Clone, PartialEq, Serialize)]

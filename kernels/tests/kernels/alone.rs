@@ -1,0 +1,13 @@
+//! For what is counted for the whole process: one test after the other.
+
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use cubecl::client::Client;
+
+static ALONE: Mutex<()> = Mutex::new(());
+
+/// A client that no other test uses while the guard lives.
+pub fn alone() -> Option<(MutexGuard<'static, ()>, Client)> {
+    let guard = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    Some((guard, crate::adapter::find()?))
+}
