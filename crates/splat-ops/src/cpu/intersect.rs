@@ -107,6 +107,11 @@ impl<T: Real> Footprint<T> {
         }
     }
 
+    /// The dy of the ellipse's right end, where z2 = 0; the left one lies opposite.
+    pub(super) fn end(&self) -> T {
+        -self.w21 / self.w22 * self.half[0]
+    }
+
     /// Left and right end of the part of the ellipse between two rows, from the mean: at one of them, or where the whole
     /// ellipse has its end.
     #[inline(always)]
@@ -118,8 +123,7 @@ impl<T: Real> Footprint<T> {
         let (middle, half) = (dy.map(|dy| self.slope * dy), dy.map(half_width));
         let left = (middle[0] - half[0]).least(middle[1] - half[1]);
         let right = (middle[0] + half[0]).greatest(middle[1] + half[1]);
-        // The right end has z2 = 0, the left one lies opposite.
-        let end = -self.w21 / self.w22 * self.half[0];
+        let end = self.end();
         let inside = |y: T| y >= dy[0] && y <= dy[1];
         [
             if inside(-end) { -self.half[0] } else { left },

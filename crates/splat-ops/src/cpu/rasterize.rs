@@ -8,12 +8,12 @@
 //! image += c alpha T;  T *= 1 - alpha
 //! ```
 //!
-//! Splats are prepared once per view. Of a tile's rows those pixels only are worked on that a splat's
-//! ellipse reaches, in blocks of eight, in loops of fixed width without branches that the compiler turns into SIMD code
-//! for the processor it finds at run time.
+//! Splats are prepared once per view. A tile is worked on in blocks of four by four pixels, each with the splats whose
+//! ellipse reaches it; both directions go over these in several short passes, of fixed width and without branches, which
+//! the compiler turns into SIMD code for the processor it finds at run time.
 
+mod batch;
 mod blend;
-mod blocks;
 mod gradient;
 mod splat;
 mod work;
@@ -33,8 +33,8 @@ use super::simd::{prefetch, vectorized};
 use crate::OpError;
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::RasterizeArgs;
+use batch::Reached;
 use blend::BlendTile;
-use blocks::Blocks;
 use gradient::{GradientTile, MOMENTS, Upstream};
 use splat::{AHEAD, Splat};
 
@@ -115,7 +115,7 @@ impl<T: Real> Listed<T> {
 struct Frame<T> {
     listed: Listed<T>,
     /// By row of tiles.
-    blocks: Vec<Blocks>,
+    reached: Vec<Reached>,
     /// `[H, W]`: what is left of the light at each pixel. One minus alpha would lose its digits.
     transmittance: Vec<T>,
     /// `[H, W]`: the place, in the list of the pixel's tile, of the splat before which it stopped; `i32::MAX` where it
@@ -149,6 +149,13 @@ impl<'a, T: Real> View<'a, T> {
             grid: Grid::new(args),
             args,
         }
+    }
+
+    /// Some of the colours of a splat.
+    #[inline(always)]
+    fn colors<const GROUP: usize>(&self, index: u32, first: usize) -> [T; GROUP] {
+        let colors = &self.colors[index as usize * self.channels + first..][..GROUP];
+        core::array::from_fn(|i| colors[i])
     }
 
     /// Pixels in one row of tiles (the last row of tiles may have fewer).
@@ -259,7 +266,7 @@ fn blend<T: Real>(
     let (slab, pixels) = (view.slab(), view.width * view.height);
     let mut transmittance = overwritten::<T>(pixels);
     let mut stop = overwritten::<i32>(pixels);
-    let blocks = image
+    let reached = image
         .par_chunks_mut(slab * (view.channels + 1))
         .zip(transmittance.par_chunks_mut(slab))
         .zip(stop.par_chunks_mut(slab))
@@ -276,42 +283,30 @@ fn blend<T: Real>(
         .collect();
     Frame {
         listed,
-        blocks,
+        reached,
         transmittance,
         stop,
     }
 }
 
 vectorized! {
-    /// Renders one row of tiles into its part of the image; returns the blocks that it worked on.
+    /// Renders one row of tiles into its part of the image; returns which blocks each splat reaches.
     fn blend_row_of_tiles<T: Real, const FMA: bool>(
         view: &View<T>,
         ty: usize,
         slab: Slab<T>,
-    ) -> Blocks {
-        // With a number of channels that the compiler knows, their loops are unrolled.
-        match view.channels {
-            3 => blend_row::<T, FMA>(view, ty, slab, 3),
-            channels => blend_row::<T, FMA>(view, ty, slab, channels),
+    ) -> Reached {
+        let channels = view.channels;
+        let mut tile = BlendTile::new(channels);
+        let mut slab = slab;
+        let mut reached = Reached::with_capacity(view.lists.row_of_tiles(ty, view.grid).len());
+        for tx in 0..view.grid.columns {
+            let list = view.lists.tile(ty * view.grid.columns + tx);
+            tile.blend::<FMA>(view, list, [tx, ty], channels, &mut reached, &mut ());
+            tile.store(view, [tx, ty], &mut slab);
         }
+        reached
     }
-}
-
-#[inline(always)]
-fn blend_row<T: Real, const FMA: bool>(
-    view: &View<T>,
-    ty: usize,
-    mut slab: Slab<T>,
-    channels: usize,
-) -> Blocks {
-    let mut tile = BlendTile::new(channels);
-    let mut blocks = Blocks::new(view.lists.row_of_tiles(ty, view.grid).len());
-    for tx in 0..view.grid.columns {
-        let list = view.lists.tile(ty * view.grid.columns + tx);
-        tile.blend::<FMA>(view, list, [tx, ty], channels, &mut blocks, &mut ());
-        tile.store(view, [tx, ty], &mut slab, channels);
-    }
-    blocks
 }
 
 pub(super) fn backward<T: Real>(
@@ -351,7 +346,7 @@ pub(super) fn backward<T: Real>(
             .enumerate()
             .with_max_len(ROWS_AT_ONCE)
             .map(|(ty, partials)| {
-                row_of_tiles_backward(&view, &frame.blocks[ty], &upstream, ty, partials)
+                row_of_tiles_backward(&view, &frame.reached[ty], &upstream, ty, partials)
             })
             .collect();
         for row in backgrounds {
@@ -373,41 +368,26 @@ vectorized! {
     /// Writes the sums of one row of tiles; returns its share of the background's gradient.
     fn row_of_tiles_backward<T: Real, const FMA: bool>(
         view: &View<T>,
-        blocks: &Blocks,
+        reached: &[u16],
         upstream: &Upstream<T>,
         ty: usize,
         partials: &mut [T],
     ) -> Vec<T> {
-        match view.channels {
-            3 => row_backward::<T, FMA>(view, blocks, upstream, ty, partials, 3),
-            channels => row_backward::<T, FMA>(view, blocks, upstream, ty, partials, channels),
+        let channels = view.channels;
+        let mut background = vec![T::ZERO; channels];
+        let mut tile = GradientTile::new(channels);
+        let (mut reached, mut partials) = (reached, partials);
+        for tx in 0..view.grid.columns {
+            let list = view.lists.tile(ty * view.grid.columns + tx);
+            let length = list.len() * (MOMENTS + channels);
+            let (sums, later) = core::mem::take(&mut partials).split_at_mut(length);
+            let (of_tile, rest) = reached.split_at(list.len());
+            (partials, reached) = (later, rest);
+            tile.load(view, upstream, [tx, ty], &mut background);
+            tile.walk::<FMA>(view, list, [tx, ty], channels, of_tile, sums);
         }
+        background
     }
-}
-
-#[inline(always)]
-fn row_backward<T: Real, const FMA: bool>(
-    view: &View<T>,
-    blocks: &Blocks,
-    upstream: &Upstream<T>,
-    ty: usize,
-    mut partials: &mut [T],
-    channels: usize,
-) -> Vec<T> {
-    let mut background = vec![T::ZERO; channels];
-    let mut tile = GradientTile::new(channels);
-    let (mut first, mut end) = (0, 0);
-    for tx in 0..view.grid.columns {
-        let list = view.lists.tile(ty * view.grid.columns + tx);
-        let length = list.len() * (MOMENTS + channels);
-        let (sums, rest) = core::mem::take(&mut partials).split_at_mut(length);
-        partials = rest;
-        tile.load(view, upstream, [tx, ty], channels, &mut background);
-        end += blocks.count(first..first + list.len());
-        tile.walk::<FMA>(view, list, [tx, ty], channels, (blocks, first, end), sums);
-        first += list.len();
-    }
-    background
 }
 
 /// The part of `partials` that belongs to each row of tiles.

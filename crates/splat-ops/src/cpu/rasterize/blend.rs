@@ -1,39 +1,44 @@
 //! Blends the splats of a tile, front to back.
+//!
+//! Block by block, and each block in three passes over the splats that reach it: raw alphas, which depend on nothing
+//! else; weights, one splat after the other; colours, a product of matrices. Each is a short loop, of which the processor
+//! has several turns under way at once. All in one, it would wait for every exponential.
 
 use super::super::intersect::TILE;
 use super::super::real::Real;
-use super::super::simd::prefetch;
-use super::blocks::Blocks;
-use super::splat::{AHEAD, Centres, LANES, PLANE, Splat, Thresholds, Window, block, block_mut};
+use super::batch::{BATCH, Batch, Reached, by_groups};
+use super::splat::{Aligned, BLOCKS, LANES, Lanes, Thresholds, centres, corner, in_blocks, least};
 use super::work::Tally;
 use super::{Slab, View};
 
-/// After so many splats it is looked which pixels still take light.
-const LOOK: usize = 8;
-
-/// The pixels of a tile while it is being blended.
+/// The pixels of a tile while it is being blended, by block.
 pub(super) struct BlendTile<T> {
-    transmittance: [T; PLANE],
+    transmittance: [Aligned<Lanes<T>>; BLOCKS],
     /// The least raw alpha that still counts: `alpha_min`, infinity once the pixel has stopped or where
     /// there is none.
-    gate: [T; PLANE],
+    gate: [Aligned<Lanes<T>>; BLOCKS],
     /// The place of the splat before which the pixel stopped; `i32::MAX` while it has not.
-    stop: [i32; PLANE],
-    /// D planes of colour.
-    colors: Vec<[T; PLANE]>,
+    stop: [Aligned<Lanes<i32>>; BLOCKS],
+    /// D of each block.
+    colors: Vec<Aligned<Lanes<T>>>,
+    batch: Batch<T>,
+    /// Of every splat that reaches the block at hand: raw alphas, then weights.
+    weights: [Aligned<Lanes<T>>; BATCH],
 }
 
 impl<T: Real> BlendTile<T> {
     pub(super) fn new(channels: usize) -> Self {
         Self {
-            transmittance: [T::ONE; PLANE],
-            gate: [T::of(f64::INFINITY); PLANE],
-            stop: [i32::MAX; PLANE],
-            colors: vec![[T::ZERO; PLANE]; channels],
+            transmittance: [Aligned([T::ONE; LANES]); BLOCKS],
+            gate: [Aligned([T::of(f64::INFINITY); LANES]); BLOCKS],
+            stop: [Aligned([i32::MAX; LANES]); BLOCKS],
+            colors: vec![Aligned([T::ZERO; LANES]); channels * BLOCKS],
+            batch: Batch::new(),
+            weights: [Aligned([T::ZERO; LANES]); BATCH],
         }
     }
 
-    /// Starts a tile anew and blends the splats of its list.
+    /// Starts a tile anew and blends the splats of its list; adds which blocks each of them reaches.
     #[inline(always)]
     pub(super) fn blend<const FMA: bool>(
         &mut self,
@@ -41,139 +46,163 @@ impl<T: Real> BlendTile<T> {
         list: &[u32],
         tile: [usize; 2],
         channels: usize,
-        blocks: &mut Blocks,
+        reached: &mut Reached,
         tally: &mut impl Tally,
     ) {
         let thresholds = Thresholds::<T>::new(view.args);
-        let centres = Centres::<T>::new(tile);
-        self.begin(view.inside(tile), &thresholds);
-        let mut open = self.open();
-        let mut any_stopped = 0;
+        let corner = corner(tile);
+        let mut open = self.begin(view.inside(tile), &thresholds);
+        let end = reached.len() + list.len();
 
-        for (place, index) in list.iter().enumerate() {
-            let index = *index as usize;
-            let splat = &view.splats[index];
-            let color = &view.colors[index * channels..][..channels];
-            let next = list.get(place + AHEAD);
-            prefetch(view.splats, next.map(|index| *index as usize));
-            for at in blocks.cover(splat, &centres, &open) {
-                any_stopped |= self.add::<FMA>(
-                    splat,
-                    color,
-                    &centres,
-                    *at,
-                    place as i32,
-                    &thresholds,
-                    tally,
-                );
-            }
-            if place % LOOK == LOOK - 1 && any_stopped != 0 {
-                open = self.open();
-                if open.to.iter().all(|to| *to == 0) {
-                    blocks.skip(list.len() - 1 - place);
-                    break;
+        for (number, part) in list.chunks(BATCH).enumerate() {
+            self.batch.gather(view, part);
+            let first = reached.len();
+            let splats = self.batch.splats.iter();
+            reached.extend(splats.map(|splat| splat.blocks(corner) & open));
+            self.batch.places.fill(&reached[first..]);
+            for block in 0..BLOCKS {
+                if open >> block & 1 == 0 {
+                    continue;
                 }
-                any_stopped = 0;
+                self.evaluate::<FMA>(block, corner, &thresholds, tally);
+                let place = (number * BATCH) as i32;
+                let (count, is_open) = self.weigh::<FMA>(block, place, &thresholds, tally);
+                by_groups!(self.add_colors::<FMA>(channels, view, part, block, count));
+                if !is_open {
+                    open &= !(1 << block);
+                }
+            }
+            if open == 0 {
+                break;
             }
         }
+        reached.resize(end, 0);
     }
 
+    /// Clears the tile; returns which blocks have pixels, a bit for each.
     #[inline(always)]
-    fn begin(&mut self, [columns, rows]: [usize; 2], thresholds: &Thresholds<T>) {
-        let closed = T::of(f64::INFINITY);
-        self.transmittance = [T::ONE; PLANE];
-        self.stop = [i32::MAX; PLANE];
-        self.colors.fill([T::ZERO; PLANE]);
-        for (row, gates) in self.gate.chunks_exact_mut(TILE).enumerate() {
-            for (column, gate) in gates.iter_mut().enumerate() {
-                let exists = row < rows && column < columns;
-                *gate = if exists { thresholds.alpha_min } else { closed };
+    fn begin(&mut self, [columns, rows]: [usize; 2], thresholds: &Thresholds<T>) -> u16 {
+        self.transmittance = [Aligned([T::ONE; LANES]); BLOCKS];
+        self.gate = [Aligned([T::of(f64::INFINITY); LANES]); BLOCKS];
+        self.stop = [Aligned([i32::MAX; LANES]); BLOCKS];
+        self.colors.fill(Aligned([T::ZERO; LANES]));
+        let mut open = 0;
+        for row in 0..rows {
+            for column in 0..columns {
+                let [block, lane] = in_blocks(column, row);
+                self.gate[block].0[lane] = thresholds.alpha_min;
+                open |= 1 << block;
             }
         }
+        open
     }
 
-    /// In each row, the span of the pixels that still take light.
+    /// Raw alphas of the splats that reach a block.
     #[inline(always)]
-    fn open(&self) -> Window {
-        let closed = T::of(f64::INFINITY);
-        let mut window = Window::CLOSED;
-        window.from = [TILE as i32; TILE];
-        for (row, gates) in self.gate.chunks_exact(TILE).enumerate() {
-            for (column, gate) in (0..).zip(gates) {
-                let is_open = *gate < closed;
-                let (from, to) = (
-                    if is_open { column } else { TILE as i32 },
-                    if is_open { column + 1 } else { 0 },
-                );
-                window.from[row] = window.from[row].min(from);
-                window.to[row] = window.to[row].max(to);
-            }
-        }
-        window
-    }
-
-    /// Blends one splat into the block that begins `at` a pixel; not zero when one of its pixels stopped.
-    #[inline(always)]
-    fn add<const FMA: bool>(
+    fn evaluate<const FMA: bool>(
         &mut self,
-        splat: &Splat<T>,
-        color: &[T],
-        centres: &Centres<T>,
-        at: u8,
+        block: usize,
+        corner: [T; 2],
+        thresholds: &Thresholds<T>,
+        tally: &mut impl Tally,
+    ) {
+        let [xs, ys] = centres(corner, block);
+        for (weights, splat) in self.weights.iter_mut().zip(self.batch.reaching(block)) {
+            let mut raw = [T::ZERO; LANES];
+            for i in 0..LANES {
+                (_, _, raw[i]) = splat.at::<FMA>(xs[i], ys[i]);
+                tally.tested(thresholds.seen(raw[i]));
+            }
+            *weights = Aligned(raw);
+        }
+    }
+
+    /// Turns raw alphas into weights, the share of a pixel's light that each splat sends. The list's batch begins at a
+    /// `place`. Returns how many splats there are until all pixels of the block have stopped, and whether any has not.
+    #[inline(always)]
+    fn weigh<const FMA: bool>(
+        &mut self,
+        block: usize,
         place: i32,
         thresholds: &Thresholds<T>,
         tally: &mut impl Tally,
-    ) -> u32 {
-        let (dx, dy) = centres.from(splat.mean, at);
-        let w22_dy = splat.along_y(dy);
-        // Copies: behind references they might alias what is written, which bars SIMD.
-        let (before, gate) = (*block(&self.transmittance, at), *block(&self.gate, at));
-        let (mut left, mut shares) = (before, [T::ZERO; LANES]);
-        let mut any_stops = 0;
-        for i in 0..LANES {
-            let (_, _, falloff) = splat.falloff::<FMA>(dx[i], w22_dy);
-            let raw = splat.opacity * falloff;
-            let alpha = thresholds.alpha(raw);
-            // Every store is unconditional: masked ones are slow. Without a share nothing changes, exactly.
-            shares[i] = if raw >= gate[i] { alpha } else { T::ZERO };
-            left[i] = T::multiply_add::<FMA>(-shares[i], before[i], before[i]);
-            any_stops |= u32::from(thresholds.stops(left[i]));
-            tally.pair(
-                thresholds.seen(raw),
-                raw >= gate[i] && !thresholds.stops(left[i]),
-            );
-        }
-        // Once in a pixel's life; for all lanes without a branch.
-        if any_stops != 0 {
-            let (mut gate, mut stop) = (gate, *block(&self.stop, at));
+    ) -> (usize, bool) {
+        let closed = T::of(f64::INFINITY);
+        let (transmittance, gates) = (&mut self.transmittance[block], &mut self.gate[block]);
+        let places = self.batch.places.of(block);
+        for (number, (weights, in_batch)) in self.weights.iter_mut().zip(places).enumerate() {
+            // Copies: behind references they might alias what is written, which bars SIMD.
+            let (Aligned(raw), Aligned(before), Aligned(gate)) = (*weights, *transmittance, *gates);
+            let [mut shares, mut left] = [[T::ZERO; LANES]; 2];
             for i in 0..LANES {
-                let stops = thresholds.stops(left[i]);
-                left[i] = if stops { before[i] } else { left[i] };
-                shares[i] = if stops { T::ZERO } else { shares[i] };
-                gate[i] = if stops { T::of(f64::INFINITY) } else { gate[i] };
-                stop[i] = if stops { place } else { stop[i] };
+                // Every store is unconditional: masked ones are slow. Without a share nothing changes, exactly.
+                let alpha = thresholds.alpha(raw[i]);
+                shares[i] = if raw[i] >= gate[i] { alpha } else { T::ZERO };
+                left[i] = T::multiply_add::<FMA>(-shares[i], before[i], before[i]);
+                tally.blended(raw[i] >= gate[i] && !thresholds.stops(left[i]));
             }
-            *block_mut(&mut self.gate, at) = gate;
-            *block_mut(&mut self.stop, at) = stop;
-        }
-        *block_mut(&mut self.transmittance, at) = left;
-        let mut weights = [T::ZERO; LANES];
-        for i in 0..LANES {
-            weights[i] = shares[i] * before[i];
-        }
-        let planes = &mut self.colors[..color.len()];
-        for (plane, color) in planes.iter_mut().zip(color) {
-            let (lanes, color) = (block_mut(plane, at), *color);
+            // Once in a pixel's life; for all lanes without a branch.
+            if thresholds.stops(least(&left)) {
+                let (mut gate, mut stop) = (gate, self.stop[block].0);
+                let place = place + i32::from(*in_batch);
+                for i in 0..LANES {
+                    let stops = thresholds.stops(left[i]);
+                    left[i] = if stops { before[i] } else { left[i] };
+                    shares[i] = if stops { T::ZERO } else { shares[i] };
+                    gate[i] = if stops { closed } else { gate[i] };
+                    stop[i] = if stops { place } else { stop[i] };
+                }
+                (gates.0, self.stop[block].0) = (gate, stop);
+                if least(&gate) == closed {
+                    return (number, false);
+                }
+            }
+            transmittance.0 = left;
             for i in 0..LANES {
-                lanes[i] = T::multiply_add::<FMA>(color, weights[i], lanes[i]);
+                weights.0[i] = shares[i] * before[i];
             }
         }
-        any_stops
+        (places.len(), true)
+    }
+
+    /// Adds the colours of the first splats that reach a block, times their weights.
+    #[inline(always)]
+    fn add_colors<const FMA: bool, const GROUP: usize>(
+        &mut self,
+        first: usize,
+        view: &View<T>,
+        list: &[u32],
+        block: usize,
+        count: usize,
+    ) {
+        let planes = &mut self.colors[block * view.channels + first..][..GROUP];
+        let mut sums: [Lanes<T>; GROUP] = core::array::from_fn(|i| planes[i].0);
+        let places = self.batch.places.of(block);
+        for (weights, place) in self.weights[..count].iter().zip(places) {
+            let colors = view.colors::<GROUP>(list[usize::from(*place)], first);
+            for (sum, color) in sums.iter_mut().zip(colors) {
+                for i in 0..LANES {
+                    sum[i] = T::multiply_add::<FMA>(color, weights.0[i], sum[i]);
+                }
+            }
+        }
+        for (plane, sum) in planes.iter_mut().zip(sums) {
+            plane.0 = sum;
+        }
     }
 
     /// Writes the tile into its row of tiles, with the background behind it.
     #[inline(always)]
-    pub(super) fn store(
+    pub(super) fn store(&self, view: &View<T>, [tx, ty]: [usize; 2], slab: &mut Slab<T>) {
+        // With a number of channels that the compiler knows, their loops are unrolled.
+        match view.channels {
+            3 => self.store_channels(view, [tx, ty], slab, 3),
+            channels => self.store_channels(view, [tx, ty], slab, channels),
+        }
+    }
+
+    #[inline(always)]
+    fn store_channels(
         &self,
         view: &View<T>,
         [tx, ty]: [usize; 2],
@@ -183,16 +212,17 @@ impl<T: Real> BlendTile<T> {
         let [columns, rows] = view.inside([tx, ty]);
         for row in 0..rows {
             for column in 0..columns {
-                let (at, pixel) = (row * TILE + column, row * view.width + tx * TILE + column);
-                let left = self.transmittance[at];
+                let [block, lane] = in_blocks(column, row);
+                let pixel = row * view.width + tx * TILE + column;
+                let left = self.transmittance[block].0[lane];
                 let out = &mut slab.image[pixel * (channels + 1)..(pixel + 1) * (channels + 1)];
                 for channel in 0..channels {
                     let behind = view.background.map_or(T::ZERO, |b| b[channel]);
-                    out[channel] = self.colors[channel][at] + left * behind;
+                    out[channel] = self.colors[block * channels + channel].0[lane] + left * behind;
                 }
                 out[channels] = T::ONE - left;
                 slab.transmittance[pixel] = left;
-                slab.stop[pixel] = self.stop[at];
+                slab.stop[pixel] = self.stop[block].0[lane];
             }
         }
     }

@@ -17,10 +17,9 @@
 
 use super::super::intersect::TILE;
 use super::super::real::Real;
-use super::super::simd::prefetch;
 use super::View;
-use super::blocks::Blocks;
-use super::splat::{AHEAD, Centres, LANES, Lanes, PLANE, Splat, Thresholds, block, block_mut};
+use super::batch::{BATCH, Batch, by_groups};
+use super::splat::{Aligned, BLOCKS, LANES, Lanes, Thresholds, centres, corner, in_blocks};
 
 /// Sums per splat before those of its D colours.
 pub(super) const MOMENTS: usize = 6;
@@ -32,26 +31,55 @@ pub(super) struct Upstream<'a, T> {
     pub(super) stop: &'a [i32],
 }
 
-/// The pixels of a tile while they are walked back to front.
+/// The pixels of a tile while they are walked back to front, by block.
 pub(super) struct GradientTile<T> {
     /// Transmittance behind the splats walked so far; in front of them after the next one.
-    transmittance: [T; PLANE],
+    transmittance: [Aligned<Lanes<T>>; BLOCKS],
     /// What lies behind, as the loss sees it: sum of (c . grad) alpha T over the splats behind, plus
     /// the final transmittance times (background . grad - grad of alpha).
-    behind: [T; PLANE],
+    behind: [Aligned<Lanes<T>>; BLOCKS],
     /// The place of the splat before which the pixel stopped.
-    stop: [i32; PLANE],
-    /// D planes: gradient of the image.
-    grad: Vec<[T; PLANE]>,
+    stop: [Aligned<Lanes<i32>>; BLOCKS],
+    /// D of each block: gradient of the image.
+    grad: Vec<Aligned<Lanes<T>>>,
+    batch: Batch<T>,
+    /// Of every splat that reaches the block at hand.
+    pairs: Vec<Aligned<Pairs<T>>>,
+    /// `MOMENTS + D` sums of each splat of the batch, each in parts that are added last.
+    sums: Vec<Aligned<Parts<T>>>,
+}
+
+/// A sum over pixels, in as many parts as there are pixels in half a block.
+type Parts<T> = [T; LANES / 2];
+
+/// A splat and each pixel of a block.
+#[derive(Clone, Copy)]
+struct Pairs<T> {
+    z1: Lanes<T>,
+    z2: Lanes<T>,
+    /// Raw alpha, and then g.
+    raw: Lanes<T>,
+    /// c . grad, and then the splat's weight.
+    toward: Lanes<T>,
 }
 
 impl<T: Real> GradientTile<T> {
     pub(super) fn new(channels: usize) -> Self {
+        let none = [T::ZERO; LANES];
+        let pairs = Pairs {
+            z1: none,
+            z2: none,
+            raw: none,
+            toward: none,
+        };
         Self {
-            transmittance: [T::ONE; PLANE],
-            behind: [T::ZERO; PLANE],
-            stop: [0; PLANE],
-            grad: vec![[T::ZERO; PLANE]; channels],
+            transmittance: [Aligned([T::ONE; LANES]); BLOCKS],
+            behind: [Aligned(none); BLOCKS],
+            stop: [Aligned([0; LANES]); BLOCKS],
+            grad: vec![Aligned(none); channels * BLOCKS],
+            batch: Batch::new(),
+            pairs: vec![Aligned(pairs); BATCH],
+            sums: vec![Aligned([T::ZERO; LANES / 2]); BATCH * (MOMENTS + channels)],
         }
     }
 
@@ -62,38 +90,53 @@ impl<T: Real> GradientTile<T> {
         &mut self,
         view: &View<T>,
         upstream: &Upstream<T>,
+        tile: [usize; 2],
+        background: &mut [T],
+    ) {
+        // With a number of channels that the compiler knows, their loops are unrolled.
+        match view.channels {
+            3 => self.load_channels(view, upstream, tile, 3, background),
+            channels => self.load_channels(view, upstream, tile, channels, background),
+        }
+    }
+
+    #[inline(always)]
+    fn load_channels(
+        &mut self,
+        view: &View<T>,
+        upstream: &Upstream<T>,
         [tx, ty]: [usize; 2],
         channels: usize,
         background: &mut [T],
     ) {
-        self.transmittance = [T::ONE; PLANE];
-        self.behind = [T::ZERO; PLANE];
-        self.stop = [0; PLANE];
-        self.grad.fill([T::ZERO; PLANE]);
+        self.transmittance = [Aligned([T::ONE; LANES]); BLOCKS];
+        self.behind = [Aligned([T::ZERO; LANES]); BLOCKS];
+        self.stop = [Aligned([0; LANES]); BLOCKS];
+        self.grad.fill(Aligned([T::ZERO; LANES]));
         let [columns, rows] = view.inside([tx, ty]);
         for row in 0..rows {
             for column in 0..columns {
-                let at = row * TILE + column;
+                let [block, lane] = in_blocks(column, row);
                 let pixel = (ty * TILE + row) * view.width + tx * TILE + column;
                 let grad = &upstream.grad[pixel * (channels + 1)..(pixel + 1) * (channels + 1)];
                 let left = upstream.transmittance[pixel];
                 let mut behind = -grad[channels];
                 for channel in 0..channels {
-                    self.grad[channel][at] = grad[channel];
+                    self.grad[block * channels + channel].0[lane] = grad[channel];
                     background[channel] += left * grad[channel];
                     if let Some(color) = view.background {
                         behind += color[channel] * grad[channel];
                     }
                 }
-                self.transmittance[at] = left;
-                self.behind[at] = left * behind;
-                self.stop[at] = upstream.stop[pixel];
+                self.transmittance[block].0[lane] = left;
+                self.behind[block].0[lane] = left * behind;
+                self.stop[block].0[lane] = upstream.stop[pixel];
             }
         }
     }
 
-    /// Walks the list back to front and writes the sums of each splat over the tile, `MOMENTS + D` values. The list's pairs
-    /// have the `blocks` from the `first` on, which end at the given one.
+    /// Walks the list back to front and writes the sums of each splat over the tile, `MOMENTS + D` values. The splats
+    /// reach the blocks that the forward pass found.
     #[inline(always)]
     pub(super) fn walk<const FMA: bool>(
         &mut self,
@@ -101,116 +144,192 @@ impl<T: Real> GradientTile<T> {
         list: &[u32],
         tile: [usize; 2],
         channels: usize,
-        (blocks, first, mut end): (&Blocks, usize, usize),
+        reached: &[u16],
         partials: &mut [T],
     ) {
         let width = MOMENTS + channels;
         let thresholds = Thresholds::<T>::new(view.args);
-        let centres = Centres::<T>::new(tile);
-        let mut color_sums = vec![[T::ZERO; LANES]; channels];
-
-        for (place, index) in list.iter().enumerate().rev() {
-            let index = *index as usize;
-            let splat = &view.splats[index];
-            let color = &view.colors[index * channels..][..channels];
-            let next = list.get(place.wrapping_sub(AHEAD));
-            prefetch(view.splats, next.map(|index| *index as usize));
-            let mut sums = [[T::ZERO; LANES]; MOMENTS];
-            color_sums.fill([T::ZERO; LANES]);
-            for at in blocks.before(&mut end, first + place) {
-                self.step::<FMA>(
-                    splat,
-                    color,
-                    &centres,
-                    *at,
-                    place as i32,
-                    &thresholds,
-                    &mut sums,
-                    &mut color_sums,
-                );
+        let corner = corner(tile);
+        let batches = list.chunks(BATCH).zip(reached.chunks(BATCH));
+        let batches = batches.zip(partials.chunks_mut(BATCH * width));
+        for (number, ((list, reached), partials)) in batches.enumerate().rev() {
+            self.batch.gather(view, list);
+            self.batch.places.fill(reached);
+            self.sums[..list.len() * width].fill(Aligned([T::ZERO; LANES / 2]));
+            let first = (number * BATCH) as i32;
+            for block in 0..BLOCKS {
+                let count = self.count(block, first);
+                if count > 0 {
+                    self.evaluate::<FMA>(block, count, corner);
+                    by_groups!(self.look::<FMA>(channels, view, list, block, count));
+                    self.step::<FMA>(block, count, first, &thresholds);
+                    self.add_moments::<FMA>(block, count, width);
+                    by_groups!(self.add_colors::<FMA>(channels, channels, block, count));
+                }
             }
-            // Or else the compiler takes the lanes apart for the totals already in the loop.
-            let (sums, color_sums) = core::hint::black_box((&sums, &color_sums));
-            let out = &mut partials[place * width..(place + 1) * width];
-            for (out, lanes) in out.iter_mut().zip(sums.iter().chain(color_sums)) {
-                *out = total(lanes);
+            for (out, Aligned(parts)) in partials.iter_mut().zip(&self.sums) {
+                *out = total(parts);
             }
         }
     }
 
-    /// Steps in front of one splat in the block that begins `at` a pixel, and adds to its sums.
+    /// How many splats of the batch, which begins at a place of the list, reach a block before its last pixel stopped.
+    #[inline(always)]
+    fn count(&self, block: usize, first: i32) -> usize {
+        let stop = self.stop[block]
+            .0
+            .iter()
+            .fold(0, |last, stop| last.max(*stop));
+        let places = self.batch.places.of(block);
+        let is_behind = |place: &&u8| first + i32::from(**place) >= stop;
+        places.len() - places.iter().rev().take_while(is_behind).count()
+    }
+
+    /// Raw alphas of the first splats that reach a block.
+    #[inline(always)]
+    fn evaluate<const FMA: bool>(&mut self, block: usize, count: usize, corner: [T; 2]) {
+        let [xs, ys] = centres(corner, block);
+        for (Aligned(pairs), splat) in self.pairs[..count]
+            .iter_mut()
+            .zip(self.batch.reaching(block))
+        {
+            // Copies, here and below: behind references they might alias what is written, which bars SIMD.
+            let [mut z1, mut z2, mut raw] = [[T::ZERO; LANES]; 3];
+            for i in 0..LANES {
+                (z1[i], z2[i], raw[i]) = splat.at::<FMA>(xs[i], ys[i]);
+            }
+            (pairs.z1, pairs.z2, pairs.raw) = (z1, z2, raw);
+        }
+    }
+
+    /// What the loss thinks of the splats' colours at every pixel, c . grad.
+    #[inline(always)]
+    fn look<const FMA: bool, const GROUP: usize>(
+        &mut self,
+        first: usize,
+        view: &View<T>,
+        list: &[u32],
+        block: usize,
+        count: usize,
+    ) {
+        let planes = &self.grad[block * view.channels + first..][..GROUP];
+        let grads: [Lanes<T>; GROUP] = core::array::from_fn(|i| planes[i].0);
+        let places = self.batch.places.of(block);
+        for (Aligned(pairs), place) in self.pairs[..count].iter_mut().zip(places) {
+            let colors = view.colors::<GROUP>(list[usize::from(*place)], first);
+            let mut toward = if first == 0 {
+                [T::ZERO; LANES]
+            } else {
+                pairs.toward
+            };
+            for (grad, color) in grads.iter().zip(colors) {
+                for i in 0..LANES {
+                    toward[i] = T::multiply_add::<FMA>(color, grad[i], toward[i]);
+                }
+            }
+            pairs.toward = toward;
+        }
+    }
+
+    /// Steps in front of the splats, the last one first: their weights and g.
     #[inline(always)]
     fn step<const FMA: bool>(
         &mut self,
-        splat: &Splat<T>,
-        color: &[T],
-        centres: &Centres<T>,
-        at: u8,
-        place: i32,
+        block: usize,
+        count: usize,
+        first: i32,
         thresholds: &Thresholds<T>,
-        sums: &mut [Lanes<T>; MOMENTS],
-        color_sums: &mut [Lanes<T>],
     ) {
-        let (dx, dy) = centres.from(splat.mean, at);
-        let w22_dy = splat.along_y(dy);
-        let planes = &self.grad[..color.len()];
-        let mut color_grad = [T::ZERO; LANES];
-        for (plane, color) in planes.iter().zip(color) {
-            let (lanes, color) = (block(plane, at), *color);
+        let (mut transmittance, mut behind) = (self.transmittance[block].0, self.behind[block].0);
+        let stop = self.stop[block].0;
+        let places = &self.batch.places.of(block)[..count];
+        for (Aligned(pairs), place) in self.pairs[..count].iter_mut().zip(places).rev() {
+            let (raw, toward) = (pairs.raw, pairs.toward);
+            let place = first + i32::from(*place);
+            let [mut weights, mut gs] = [[T::ZERO; LANES]; 2];
             for i in 0..LANES {
-                color_grad[i] = T::multiply_add::<FMA>(color, lanes[i], color_grad[i]);
+                let blended = thresholds.seen(raw[i]) & (place < stop[i]);
+                // Every store is unconditional: masked ones are slow. Without a share nothing changes, exactly.
+                let share = if blended {
+                    thresholds.alpha(raw[i])
+                } else {
+                    T::ZERO
+                };
+                let inverse = T::ONE / (T::ONE - share);
+                let before = transmittance[i] * inverse;
+                let dalpha = before * toward[i] - behind[i] * inverse;
+                let live = blended & !thresholds.capped(raw[i]);
+                gs[i] = if live { -raw[i] * dalpha } else { T::ZERO };
+                weights[i] = share * before;
+                behind[i] = T::multiply_add::<FMA>(weights[i], toward[i], behind[i]);
+                transmittance[i] = before;
             }
+            (pairs.raw, pairs.toward) = (gs, weights);
         }
-        // Copies: behind references they might alias what is written, which bars SIMD.
-        let mut transmittance = *block(&self.transmittance, at);
-        let (mut behind, stop) = (*block(&self.behind, at), *block(&self.stop, at));
-        let [mut one, mut z1s, mut z2s, mut z11, mut z12, mut z22] = *sums;
-        let mut weights = [T::ZERO; LANES];
-        for i in 0..LANES {
-            let (z1, z2, falloff) = splat.falloff::<FMA>(dx[i], w22_dy);
-            let raw = splat.opacity * falloff;
-            let blended = thresholds.seen(raw) & (place < stop[i]);
-            // Every store is unconditional: masked ones are slow. Without a share nothing changes, exactly.
-            let share = if blended {
-                thresholds.alpha(raw)
-            } else {
-                T::ZERO
-            };
-            let inverse = T::ONE / (T::ONE - share);
-            let before = transmittance[i] * inverse;
-            let weight = share * before;
-            let dalpha = before * color_grad[i] - behind[i] * inverse;
-            let live = blended & !thresholds.capped(raw);
-            let g = if live { -raw * dalpha } else { T::ZERO };
-            weights[i] = weight;
-            behind[i] = T::multiply_add::<FMA>(weight, color_grad[i], behind[i]);
-            transmittance[i] = before;
+        (self.transmittance[block].0, self.behind[block].0) = (transmittance, behind);
+    }
 
-            let (g1, g2) = (g * z1, g * z2);
-            one[i] += g;
-            z1s[i] += g1;
-            z2s[i] += g2;
-            z11[i] = T::multiply_add::<FMA>(g1, z1, z11[i]);
-            z12[i] = T::multiply_add::<FMA>(g1, z2, z12[i]);
-            z22[i] = T::multiply_add::<FMA>(g2, z2, z22[i]);
-        }
-        *block_mut(&mut self.transmittance, at) = transmittance;
-        *block_mut(&mut self.behind, at) = behind;
-        *sums = [one, z1s, z2s, z11, z12, z22];
-        for (sum, plane) in color_sums[..color.len()].iter_mut().zip(planes) {
-            let (lanes, mut total) = (block(plane, at), *sum);
-            for i in 0..LANES {
-                total[i] = T::multiply_add::<FMA>(weights[i], lanes[i], total[i]);
+    /// Adds a block's g times 1, z1, z2, z1^2, z1 z2 and z2^2.
+    #[inline(always)]
+    fn add_moments<const FMA: bool>(&mut self, block: usize, count: usize, width: usize) {
+        let places = self.batch.places.of(block);
+        for (Aligned(pairs), place) in self.pairs[..count].iter().zip(places) {
+            let sums = &mut self.sums[usize::from(*place) * width..][..MOMENTS];
+            let mut parts: [Parts<T>; MOMENTS] = core::array::from_fn(|i| sums[i].0);
+            let Pairs { z1, z2, raw: g, .. } = *pairs;
+            for half in [0, LANES / 2] {
+                for part in 0..LANES / 2 {
+                    let i = half + part;
+                    let (g1, g2) = (g[i] * z1[i], g[i] * z2[i]);
+                    parts[0][part] += g[i];
+                    parts[1][part] += g1;
+                    parts[2][part] += g2;
+                    parts[3][part] = T::multiply_add::<FMA>(g1, z1[i], parts[3][part]);
+                    parts[4][part] = T::multiply_add::<FMA>(g1, z2[i], parts[4][part]);
+                    parts[5][part] = T::multiply_add::<FMA>(g2, z2[i], parts[5][part]);
+                }
             }
-            *sum = total;
+            for (sum, parts) in sums.iter_mut().zip(parts) {
+                sum.0 = parts;
+            }
+        }
+    }
+
+    /// Adds a block's weights times the gradient of the image.
+    #[inline(always)]
+    fn add_colors<const FMA: bool, const GROUP: usize>(
+        &mut self,
+        first: usize,
+        channels: usize,
+        block: usize,
+        count: usize,
+    ) {
+        let planes = &self.grad[block * channels + first..][..GROUP];
+        let grads: [Lanes<T>; GROUP] = core::array::from_fn(|i| planes[i].0);
+        let width = MOMENTS + channels;
+        let places = self.batch.places.of(block);
+        for (Aligned(pairs), place) in self.pairs[..count].iter().zip(places) {
+            let at = usize::from(*place) * width + MOMENTS + first;
+            let sums = &mut self.sums[at..at + GROUP];
+            let weights = pairs.toward;
+            for (sum, grad) in sums.iter_mut().zip(&grads) {
+                let mut parts = sum.0;
+                for half in [0, LANES / 2] {
+                    for part in 0..LANES / 2 {
+                        let (weight, grad) = (weights[half + part], grad[half + part]);
+                        parts[part] = T::multiply_add::<FMA>(weight, grad, parts[part]);
+                    }
+                }
+                sum.0 = parts;
+            }
         }
     }
 }
 
-/// Sum over the lanes: halves are added to halves.
+/// Sum of the parts: halves are added to halves.
 #[inline(always)]
-fn total<T: Real>(lanes: &Lanes<T>) -> T {
-    let (mut sums, mut width) = (*lanes, LANES);
+fn total<T: Real>(parts: &Parts<T>) -> T {
+    let (mut sums, mut width) = (*parts, parts.len());
     while width > 1 {
         width /= 2;
         for i in 0..width {

@@ -5,15 +5,26 @@ use super::super::real::Real;
 use super::gradient::MOMENTS;
 use crate::settings::RasterizeArgs;
 
-/// Pixels that are worked on at once, a block: half a row of a tile, wherever it begins.
-pub(super) const LANES: usize = TILE / 2;
+/// Side of a block, the pixels that are worked on at once: as long as it is wide, since then fewest pixels are tested that
+/// a splat does not reach, whatever way it lies.
+pub(super) const SIDE: usize = 4;
+
+/// Pixels of a block, row by row.
+pub(super) const LANES: usize = SIDE * SIDE;
+
+/// Blocks in each row and each column of a tile.
+pub(super) const ACROSS: usize = TILE / SIDE;
+
+/// Blocks of a tile, row by row. As many as there are bits in [`Splat::blocks`].
+pub(super) const BLOCKS: usize = ACROSS * ACROSS;
 
 /// One value per pixel of a block.
 pub(super) type Lanes<T> = [T; LANES];
 
-/// Memory for the pixels of a tile, and so much more that a block may begin at any number of eight bits: no index needs a
-/// check.
-pub(super) const PLANE: usize = TILE * TILE + LANES;
+/// As wide registers want it in memory: what lies across two lines of the cache is read and written twice as slowly.
+#[derive(Debug, Clone, Copy)]
+#[repr(align(32))]
+pub(super) struct Aligned<V>(pub(super) V);
 
 /// So many splats before its turn a splat is fetched: it lies anywhere in memory.
 pub(super) const AHEAD: usize = 4;
@@ -31,80 +42,74 @@ pub(super) struct Splat<T> {
     w21: T,
     w22: T,
     pub(super) opacity: T,
-    /// The pixel rows that the ellipse reaches, with a pixel of slack.
-    rows: [T; 2],
     /// `sigma <= cut` along a row at dy is `|dx - slope dy| <= sqrt(reach - shrink dy^2) inverse_a`.
     slope: T,
     reach: T,
     shrink: T,
     inverse_a: T,
+    /// The dy of the ellipse's right end; its left one lies opposite.
+    end: T,
 }
 
 impl<T: Real> Splat<T> {
     pub(super) fn new(footprint: &Footprint<T>) -> Self {
         let unit = T::of(UNIT);
-        let Footprint { mean, half, .. } = *footprint;
         Self {
-            mean,
+            mean: footprint.mean,
             w11: footprint.w11 * unit,
             w21: footprint.w21 * unit,
             w22: footprint.w22 * unit,
             opacity: footprint.opacity,
-            rows: [mean[1] - half[1] - T::ONE, mean[1] + half[1] + T::ONE],
             slope: footprint.slope,
             reach: footprint.reach,
             shrink: footprint.shrink,
             inverse_a: footprint.inverse_a,
+            end: footprint.end(),
         }
     }
 
-    /// Rows of the tile that the ellipse reaches.
+    /// The blocks of the tile that the ellipse reaches, a bit for each: in each row of blocks those from where it lies
+    /// farthest left to where it lies farthest right.
     #[inline(always)]
-    pub(super) fn rows(&self, tile: &Centres<T>) -> core::ops::Range<usize> {
-        let (top, side) = (tile.ys[0], T::of(TILE as f64));
-        let row = |y: T| (y - top).greatest(T::ZERO).least(side).nearest() as usize;
-        row(self.rows[0])..TILE.min(row(self.rows[1]))
-    }
-
-    /// The columns that the ellipse reaches in each row of the tile.
-    #[inline(always)]
-    pub(super) fn spans(&self, tile: &Centres<T>) -> Window {
-        // A thousandth of a pixel stands for rounding.
-        let (slack, half_pixel, side) = (T::of(1e-3), T::of(0.5), T::of(TILE as f64));
-        let left = self.mean[0] - tile.xs[0] + half_pixel;
-        let mut spans = Window::CLOSED;
-        for row in 0..TILE {
-            let dy = tile.ys[row] - self.mean[1];
+    pub(super) fn blocks(&self, [left, top]: [T; 2]) -> u16 {
+        // From its middle to the first and the last pixel of a block; a thousandth of a pixel stands for rounding.
+        let (to_pixel, slack) = (T::of((SIDE - 1) as f64 / 2.0), T::of(1e-3));
+        let (corner, side) = (self.mean[0] - left, T::of(1.0 / SIDE as f64));
+        // In each row of blocks the first, and then the one after the last, each as a power of two: their difference
+        // is a run of bits.
+        let mut ends = [0i32; 2 * ACROSS];
+        for i in 0..2 * ACROSS {
+            let sign = if i < ACROSS { -T::ONE } else { T::ONE };
+            let first = T::of((i % ACROSS * SIDE) as f64 + 0.5);
+            let last = first + to_pixel + to_pixel;
+            let dy = (sign * self.end).greatest(top + first - self.mean[1]);
+            let dy = dy.least(top + last - self.mean[1]);
             let discriminant = self.reach - self.shrink * dy * dy;
-            let middle = left + self.slope * dy;
-            let half = discriminant.greatest(T::ZERO).sqrt() * self.inverse_a + slack;
-            // From the first column that is not left of the span to the first that is right of it.
-            let from = (middle - half).greatest(T::ZERO).least(side);
-            let to = (middle + half).greatest(T::ZERO).least(side);
-            let to = if discriminant >= T::ZERO { to } else { T::ZERO };
-            spans.from[row] = from.nearest();
-            spans.to[row] = to.nearest();
+            let half = discriminant.greatest(T::ZERO).sqrt() * self.inverse_a;
+            let end = corner + self.slope * dy + sign * (half + slack + to_pixel);
+            let end = (end * side).greatest(T::ZERO).least(T::of(ACROSS as f64));
+            let end = if discriminant >= T::ZERO {
+                end
+            } else {
+                T::ZERO
+            };
+            ends[i] = 1 << (end.nearest() & 7);
         }
-        spans
+        let mut blocks = 0;
+        for row in 0..ACROSS {
+            blocks |= (ends[row + ACROSS] - ends[row]).max(0) << (ACROSS * row);
+        }
+        blocks as u16
     }
 
-    /// (z1, z2, exp(-sigma)) at dx from the mean, z in units of [`UNIT`], `w22_dy` being that of
-    /// [`along_y`](Self::along_y). Both passes call it, so both see the same bits.
+    /// (z1, z2, raw alpha) at a pixel, z in units of [`UNIT`]. Both passes call it, so both see the same bits.
     #[inline(always)]
-    pub(super) fn falloff<const FMA: bool>(&self, dx: T, w22_dy: T) -> (T, T, T) {
+    pub(super) fn at<const FMA: bool>(&self, x: T, y: T) -> (T, T, T) {
+        let (dx, dy) = (x - self.mean[0], y - self.mean[1]);
         let z1 = self.w11 * dx;
-        let z2 = T::multiply_add::<FMA>(self.w21, dx, w22_dy);
-        (
-            z1,
-            z2,
-            T::exp2_neg::<FMA>(T::multiply_add::<FMA>(z1, z1, z2 * z2)),
-        )
-    }
-
-    /// What all pixels of a row have in common, dy from the mean.
-    #[inline(always)]
-    pub(super) fn along_y(&self, dy: T) -> T {
-        self.w22 * dy
+        let z2 = T::multiply_add::<FMA>(self.w21, dx, self.w22 * dy);
+        let falloff = T::exp2_neg::<FMA>(T::multiply_add::<FMA>(z1, z1, z2 * z2));
+        (z1, z2, self.opacity * falloff)
     }
 
     /// Gradients of screen mean, w11, w21, w22, and of the opacity, from a splat's sums of g times 1, z1, z2, z1^2, z1 z2
@@ -124,59 +129,44 @@ impl<T: Real> Splat<T> {
     }
 }
 
-/// A half-open interval of columns for each row of a tile; empty where `from` is not less than `to`.
-#[derive(Clone, Copy)]
-pub(super) struct Window {
-    pub(super) from: [i32; TILE],
-    pub(super) to: [i32; TILE],
-}
-
-impl Window {
-    pub(super) const CLOSED: Self = Self {
-        from: [0; TILE],
-        to: [0; TILE],
-    };
-}
-
-/// The values of the block that begins `at` a pixel.
+/// Centres of the pixels of a block, along x and along y.
 #[inline(always)]
-pub(super) fn block<V>(values: &[V; PLANE], at: u8) -> &Lanes<V> {
-    let values = &values[usize::from(at)..];
-    values.first_chunk().expect("a block is left")
+pub(super) fn centres<T: Real>([left, top]: [T; 2], block: usize) -> [Lanes<T>; 2] {
+    let along = |corner: T, pixel: usize| corner + T::of(pixel as f64 + 0.5);
+    let (column, row) = (block % ACROSS * SIDE, block / ACROSS * SIDE);
+    [
+        core::array::from_fn(|i| along(left, column + i % SIDE)),
+        core::array::from_fn(|i| along(top, row + i / SIDE)),
+    ]
 }
 
-/// As [`block`].
+/// The corner of a tile, in pixels.
 #[inline(always)]
-pub(super) fn block_mut<V>(values: &mut [V; PLANE], at: u8) -> &mut Lanes<V> {
-    let values = &mut values[usize::from(at)..];
-    values.first_chunk_mut().expect("a block is left")
+pub(super) fn corner<T: Real>(tile: [usize; 2]) -> [T; 2] {
+    tile.map(|at| T::of((at * TILE) as f64))
 }
 
-/// Centres of the pixels of a tile.
-pub(super) struct Centres<T> {
-    /// Of more than there are, so that a block may begin at any.
-    xs: [T; TILE + LANES],
-    ys: [T; TILE],
+/// Block and lane of a pixel of a tile.
+#[inline(always)]
+pub(super) fn in_blocks(column: usize, row: usize) -> [usize; 2] {
+    [
+        row / SIDE * ACROSS + column / SIDE,
+        row % SIDE * SIDE + column % SIDE,
+    ]
 }
 
-impl<T: Real> Centres<T> {
-    #[inline(always)]
-    pub(super) fn new([tx, ty]: [usize; 2]) -> Self {
-        let along = |tile: usize, i: usize| T::of((tile * TILE + i) as f64 + 0.5);
-        Self {
-            xs: core::array::from_fn(|i| along(tx, i)),
-            ys: core::array::from_fn(|i| along(ty, i)),
+/// The least of the lanes; halves onto halves.
+#[inline(always)]
+pub(super) fn least<T: Real>(lanes: &Lanes<T>) -> T {
+    let mut least = *lanes;
+    let mut width = LANES;
+    while width > 1 {
+        width /= 2;
+        for i in 0..width {
+            least[i] = least[i].least(least[i + width]);
         }
     }
-
-    /// From a splat's mean to the pixels of the block that begins `at` one: along x of each, along y of all.
-    #[inline(always)]
-    pub(super) fn from(&self, mean: [T; 2], at: u8) -> (Lanes<T>, T) {
-        let at = usize::from(at);
-        let xs = &self.xs[at % TILE..][..LANES];
-        let dx = core::array::from_fn(|i| xs[i] - mean[0]);
-        (dx, self.ys[at / TILE] - mean[1])
-    }
+    least[0]
 }
 
 /// The one place that decides what becomes of a (pixel, splat) pair; both passes call it.

@@ -4,7 +4,6 @@ use burn::tensor::Tensor;
 use rayon::prelude::*;
 
 use super::blend::BlendTile;
-use super::blocks::Blocks;
 use super::{Camera, Listed, View};
 use crate::backend::PROJECTED_WIDTH;
 use crate::rasterize::per_camera;
@@ -74,8 +73,7 @@ fn of_camera(camera: &Camera<f32>, args: &RasterizeArgs) -> Result<RasterizeWork
         let list = view.lists.tile(tile);
         let tile = [tile % view.grid.columns, tile / view.grid.columns];
         // Without FMA a few pairs at a threshold may fall to its other side; for a count that is nothing.
-        let blocks = &mut Blocks::new(list.len());
-        BlendTile::new(d).blend::<false>(&view, list, tile, d, blocks, &mut work);
+        BlendTile::new(d).blend::<false>(&view, list, tile, d, &mut Vec::new(), &mut work);
         work
     });
     let mut work = blended.reduce(RasterizeWork::default, |mut sum, tile| {
@@ -95,21 +93,30 @@ impl RasterizeWork {
     }
 }
 
-/// Told about every evaluated (pixel, splat) pair.
+/// Told about every (pixel, splat) pair.
 pub(super) trait Tally {
-    fn pair(&mut self, seen: bool, blended: bool);
+    /// Its alpha was evaluated.
+    fn tested(&mut self, seen: bool);
+    /// It may have been blended.
+    fn blended(&mut self, blended: bool);
 }
 
 /// Nobody counts, and it costs nothing.
 impl Tally for () {
     #[inline(always)]
-    fn pair(&mut self, _: bool, _: bool) {}
+    fn tested(&mut self, _: bool) {}
+
+    #[inline(always)]
+    fn blended(&mut self, _: bool) {}
 }
 
 impl Tally for RasterizeWork {
-    fn pair(&mut self, seen: bool, blended: bool) {
+    fn tested(&mut self, seen: bool) {
         self.tested += 1;
         self.seen += u64::from(seen);
+    }
+
+    fn blended(&mut self, blended: bool) {
         self.blended += u64::from(blended);
     }
 }
