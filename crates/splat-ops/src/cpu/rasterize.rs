@@ -36,9 +36,12 @@ use crate::settings::RasterizeArgs;
 use batch::Reached;
 use blend::BlendTile;
 use gradient::{GradientTile, MOMENTS, Upstream};
-use splat::{AHEAD, Splat};
+use splat::Splat;
 
 pub use work::{RasterizeWork, rasterize_work};
+
+/// So many partial gradients before its turn one is fetched.
+const AHEAD: usize = 16;
 
 /// Rows of tiles that a thread takes at once. Of more, which the scheduler would make it take, the last ones are often
 /// worked on alone.
@@ -101,7 +104,7 @@ impl<T: Real> Listed<T> {
         sums.fill(T::ZERO);
         for i in emitted[splat] as usize..emitted[splat + 1] as usize {
             // They lie anywhere; those of the next splats follow in `position`.
-            let next = position.get(i + 4 * AHEAD);
+            let next = position.get(i + AHEAD);
             prefetch(partials, next.map(|next| *next as usize * sums.len()));
             let row = &partials[position[i] as usize * sums.len()..][..sums.len()];
             for (sum, value) in sums.iter_mut().zip(row) {

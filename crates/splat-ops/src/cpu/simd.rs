@@ -51,8 +51,12 @@ pub(super) fn prefetch<V>(items: &[V], index: Option<usize>) {
     #[cfg(target_arch = "x86_64")]
     if let Some(item) = index.and_then(|index| items.get(index)) {
         use core::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        // SAFETY: every 64-bit x86 processor has the instruction, which reads nothing.
-        unsafe { _mm_prefetch::<_MM_HINT_T0>(core::ptr::from_ref(item).cast()) }
+        // Its end may lie in the next line of the cache.
+        let start = core::ptr::from_ref(item).cast::<i8>();
+        for byte in [start, start.wrapping_add(size_of::<V>() - 1)] {
+            // SAFETY: every 64-bit x86 processor has the instruction, which reads nothing.
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(byte) }
+        }
     }
     #[cfg(not(target_arch = "x86_64"))]
     let _ = (items, index);

@@ -34,29 +34,28 @@ pub(super) use by_groups;
 
 /// The splats, side by side.
 pub(super) struct Batch<T> {
-    pub(super) splats: Vec<Splat<T>>,
+    splats: Vec<Splat<T>>,
     pub(super) places: Places,
 }
 
 impl<T: Real> Batch<T> {
     pub(super) fn new() -> Self {
         Self {
-            splats: Vec::with_capacity(BATCH),
+            splats: vec![Splat::default(); BATCH],
             places: Places::new(),
         }
     }
 
-    /// Fetches the splats of a part of a list.
+    /// Fetches the splats of a part of a list, and returns them.
     #[inline(always)]
-    pub(super) fn gather(&mut self, view: &View<T>, list: &[u32]) {
-        self.splats.clear();
-        let splats = list.iter().enumerate().map(|(place, index)| {
+    pub(super) fn gather(&mut self, view: &View<T>, list: &[u32]) -> &[Splat<T>] {
+        for (place, (splat, index)) in self.splats.iter_mut().zip(list).enumerate() {
             let next = list.get(place + AHEAD).map(|index| *index as usize);
             prefetch(view.splats, next);
             prefetch(view.colors, next.map(|index| index * view.channels));
-            view.splats[*index as usize]
-        });
-        self.splats.extend(splats);
+            *splat = view.splats[*index as usize];
+        }
+        &self.splats[..list.len()]
     }
 
     /// Those that reach a block, in order.

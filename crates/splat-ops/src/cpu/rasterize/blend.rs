@@ -55,10 +55,12 @@ impl<T: Real> BlendTile<T> {
         let end = reached.len() + list.len();
 
         for (number, part) in list.chunks(BATCH).enumerate() {
-            self.batch.gather(view, part);
+            let splats = self.batch.gather(view, part);
             let first = reached.len();
-            let splats = self.batch.splats.iter();
-            reached.extend(splats.map(|splat| splat.blocks(corner) & open));
+            reached.resize(first + splats.len(), 0);
+            for (blocks, splat) in reached[first..].iter_mut().zip(splats) {
+                *blocks = splat.blocks(corner) & open;
+            }
             self.batch.places.fill(&reached[first..]);
             for block in 0..BLOCKS {
                 if open >> block & 1 == 0 {

@@ -27,14 +27,14 @@ pub(super) type Lanes<T> = [T; LANES];
 pub(super) struct Aligned<V>(pub(super) V);
 
 /// So many splats before its turn a splat is fetched: it lies anywhere in memory.
-pub(super) const AHEAD: usize = 4;
+pub(super) const AHEAD: usize = 12;
 
 /// The inverse Cholesky factor times this, squared, counts in powers of two: `2^-|z|^2 = exp(-sigma)`.
 /// `sqrt(log2(e) / 2)`.
 const UNIT: f64 = 0.849_321_800_288_019_1;
 
 /// What the inner loops need of a splat.
-#[derive(Debug, Clone, Copy)]
+#[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Splat<T> {
     pub(super) mean: [T; 2],
     /// [`UNIT`] times the inverse Cholesky factor.
