@@ -48,6 +48,8 @@ fn train(capture: &Arc<Capture>, device: &Device, seed: u64) -> Trained {
     config.density.every = 4;
     config.density.reset_every = 8;
     config.density.grow_gradient = 1e-5;
+    // More than such small photos ask for.
+    config.density.max_gaussians = Some(10_000);
     Trainer::builder()
         .capture(capture.clone())
         .config(config)

@@ -39,7 +39,8 @@ pub struct TrainConfig {
     pub init: InitSettings,
     /// Learning rates.
     pub rates: LearningRates,
-    /// Adaptive density control.
+    /// Adaptive density control. Where `max_gaussians` is absent, growth ends at one Gaussian for every two pixels of a photo, or
+    /// for every hundred of all photos that are trained on, whichever is more.
     pub density: AdaptiveSettings,
 }
 

@@ -227,21 +227,24 @@ impl TrainerBuilder {
             seed: self.config.seed,
         };
         let device = self.device.without_autodiff().autodiff();
-        let mut state = State::new(&self.config, run, &loss);
+        let mut config = self.config;
+        let most = config.density.max_gaussians;
+        config.density.max_gaussians = most.or_else(|| Some(worthwhile_gaussians(&capture)));
+        let mut state = State::new(&config, run, &loss);
         let gaussians = match self.resume {
             Some(checkpoint) => checkpoint.restore(&mut state, &device)?,
             None => {
                 let origin = scene_origin(&cameras);
-                first_gaussians(&capture, &self.config, run, origin, &device)?
+                first_gaussians(&capture, &config, run, origin, &device)?
             }
         };
         if state.history.counts.is_empty() {
             state.history.counts.push((0, gaussians.len()));
         }
         Ok(Trainer {
-            views: views::ViewOrder::new(self.config.seed, capture.split.train.len()),
+            views: views::ViewOrder::new(config.seed, capture.split.train.len()),
             capture,
-            config: self.config,
+            config,
             device,
             loss,
             run,
@@ -256,6 +259,17 @@ impl TrainerBuilder {
             coarse: coarse::CoarseViews::default(),
         })
     }
+}
+
+/// Beyond so many Gaussians growth is not worth its time: one for every two pixels of a photo, or for every hundred of all that
+/// are trained on (300 values for up to 59 parameters), whichever is more. docs/TRAINING.md has what more would give.
+fn worthwhile_gaussians(capture: &Capture) -> usize {
+    let pixels = |view: &usize| {
+        let view = &capture.views[*view];
+        view.width as usize * view.height as usize
+    };
+    let photos = capture.split.train.iter().map(pixels);
+    (photos.clone().sum::<usize>() / 100).max(photos.max().unwrap_or(0) / 2)
 }
 
 fn first_gaussians(
@@ -629,6 +643,28 @@ mod tests {
             .capture(capture())
             .config(config)
             .device(Device::flex())
+    }
+
+    /// Growth ends where a setting says, else where the photos do.
+    #[test]
+    fn the_photos_say_how_many_gaussians_are_worthwhile() {
+        let most = |capture: Capture, config: TrainConfig| {
+            let trainer = Trainer::builder().capture(Arc::new(capture)).config(config);
+            let trainer = trainer.device(Device::flex()).build().unwrap();
+            trainer.config.density.max_gaussians
+        };
+        let config = TrainConfig::default();
+        let mut capture = Capture::clone(&capture());
+        for view in &mut capture.views {
+            (view.width, view.height) = (40, 30);
+        }
+        capture.split.train.truncate(2);
+        assert_eq!(most(capture.clone(), config.clone()), Some(600));
+        capture.split.train = [0, 1].repeat(50);
+        assert_eq!(most(capture.clone(), config.clone()), Some(1_200));
+        let mut config = config;
+        config.density.max_gaussians = Some(7);
+        assert_eq!(most(capture, config), Some(7));
     }
 
     /// Interrupted after a refinement and resumed from the file, a run ends with the same scene.

@@ -4,10 +4,14 @@
 //! else; weights, one splat after the other; colours, a product of matrices. Each is a short loop, of which the processor
 //! has several turns under way at once. All in one, it would wait for every exponential.
 
+use core::ops::Range;
+
 use super::super::intersect::TILE;
 use super::super::real::Real;
 use super::batch::{BATCH, Batch, Reached, by_groups};
-use super::splat::{Aligned, BLOCKS, LANES, Lanes, Thresholds, centres, corner, in_blocks, least};
+use super::splat::{
+    Aligned, BLOCKS, LANES, Lanes, Thresholds, any, centres, corner, in_blocks, square,
+};
 use super::work::Tally;
 use super::{Slab, View};
 
@@ -110,12 +114,16 @@ impl<T: Real> BlendTile<T> {
     ) {
         let [xs, ys] = centres(corner, block);
         for (weights, splat) in self.weights.iter_mut().zip(self.batch.reaching(block)) {
-            let mut raw = [T::ZERO; LANES];
             for i in 0..LANES {
-                (_, _, raw[i]) = splat.at::<FMA>(xs[i], ys[i]);
-                tally.tested(thresholds.seen(raw[i]));
+                weights.0[i] = square::<T, FMA>(splat.z::<FMA>(xs[i], ys[i]));
             }
-            *weights = Aligned(raw);
+        }
+        // By itself, so that all that an exponential needs stays in registers.
+        for (weights, splat) in self.weights.iter_mut().zip(self.batch.reaching(block)) {
+            for i in 0..LANES {
+                weights.0[i] = splat.raw::<FMA>(weights.0[i]);
+                tally.tested(thresholds.seen(weights.0[i]));
+            }
         }
     }
 
@@ -129,42 +137,71 @@ impl<T: Real> BlendTile<T> {
         thresholds: &Thresholds<T>,
         tally: &mut impl Tally,
     ) -> (usize, bool) {
-        let closed = T::of(f64::INFINITY);
-        let (transmittance, gates) = (&mut self.transmittance[block], &mut self.gate[block]);
-        let places = self.batch.places.of(block);
-        for (number, (weights, in_batch)) in self.weights.iter_mut().zip(places).enumerate() {
-            // Copies: behind references they might alias what is written, which bars SIMD.
-            let (Aligned(raw), Aligned(before), Aligned(gate)) = (*weights, *transmittance, *gates);
-            let [mut shares, mut left] = [[T::ZERO; LANES]; 2];
-            for i in 0..LANES {
-                // Every store is unconditional: masked ones are slow. Without a share nothing changes, exactly.
-                let alpha = thresholds.alpha(raw[i]);
-                shares[i] = if raw[i] >= gate[i] { alpha } else { T::ZERO };
-                left[i] = T::multiply_add::<FMA>(-shares[i], before[i], before[i]);
-                tally.blended(raw[i] >= gate[i] && !thresholds.stops(left[i]));
+        let count = self.batch.places.of(block).len();
+        let mut done = 0;
+        loop {
+            done += self.weigh_until_stop::<FMA>(block, done..count, thresholds, tally);
+            if done == count {
+                return (count, true);
             }
-            // Once in a pixel's life; for all lanes without a branch.
-            if thresholds.stops(least(&left)) {
-                let (mut gate, mut stop) = (gate, self.stop[block].0);
-                let place = place + i32::from(*in_batch);
-                for i in 0..LANES {
-                    let stops = thresholds.stops(left[i]);
-                    left[i] = if stops { before[i] } else { left[i] };
-                    shares[i] = if stops { T::ZERO } else { shares[i] };
-                    gate[i] = if stops { closed } else { gate[i] };
-                    stop[i] = if stops { place } else { stop[i] };
-                }
-                (gates.0, self.stop[block].0) = (gate, stop);
-                if least(&gate) == closed {
-                    return (number, false);
-                }
-            }
-            transmittance.0 = left;
-            for i in 0..LANES {
-                weights.0[i] = shares[i] * before[i];
+            let place = place + i32::from(self.batch.places.of(block)[done]);
+            if !self.stop_pixels::<FMA>(block, done, place, thresholds) {
+                return (done, false);
             }
         }
-        (places.len(), true)
+    }
+
+    /// As far as no pixel stops; returns how many splats that are.
+    // Stopping is done elsewhere, once in a pixel's life, so that nothing here depends on it: the transmittance stays in
+    // registers.
+    #[inline(always)]
+    fn weigh_until_stop<const FMA: bool>(
+        &mut self,
+        block: usize,
+        splats: Range<usize>,
+        thresholds: &Thresholds<T>,
+        tally: &mut impl Tally,
+    ) -> usize {
+        // Copies, here and below: behind references they might alias what is written, which bars SIMD.
+        let gate = self.gate[block].0;
+        let mut before = self.transmittance[block].0;
+        let mut done = 0;
+        for weights in &mut self.weights[splats] {
+            let (shares, left) = blend::<T, FMA>(&weights.0, &gate, &before, thresholds);
+            if any(&left, |left| thresholds.stops(left)) {
+                break;
+            }
+            for i in 0..LANES {
+                tally.blended(weights.0[i] >= gate[i]);
+                weights.0[i] = shares[i] * before[i];
+                before[i] = left[i];
+            }
+            done += 1;
+        }
+        self.transmittance[block].0 = before;
+        done
+    }
+
+    /// Closes the pixels of a block that stop before a splat, which has a place in the list; returns whether others are left.
+    #[inline(always)]
+    fn stop_pixels<const FMA: bool>(
+        &mut self,
+        block: usize,
+        number: usize,
+        place: i32,
+        thresholds: &Thresholds<T>,
+    ) -> bool {
+        let (mut gate, mut stop) = (self.gate[block].0, self.stop[block].0);
+        let before = self.transmittance[block].0;
+        let (_, left) = blend::<T, FMA>(&self.weights[number].0, &gate, &before, thresholds);
+        let closed = T::of(f64::INFINITY);
+        for i in 0..LANES {
+            let stops = thresholds.stops(left[i]);
+            gate[i] = if stops { closed } else { gate[i] };
+            stop[i] = if stops { place } else { stop[i] };
+        }
+        (self.gate[block].0, self.stop[block].0) = (gate, stop);
+        any(&gate, |gate| gate < closed)
     }
 
     /// Adds the colours of the first splats that reach a block, times their weights.
@@ -228,4 +265,22 @@ impl<T: Real> BlendTile<T> {
             }
         }
     }
+}
+
+/// The alpha of a splat at each pixel that takes its light, and the transmittance behind it.
+#[inline(always)]
+fn blend<T: Real, const FMA: bool>(
+    raw: &Lanes<T>,
+    gate: &Lanes<T>,
+    before: &Lanes<T>,
+    thresholds: &Thresholds<T>,
+) -> (Lanes<T>, Lanes<T>) {
+    let [mut shares, mut left] = [[T::ZERO; LANES]; 2];
+    for i in 0..LANES {
+        // Every store is unconditional: masked ones are slow. Without a share nothing changes, exactly.
+        let alpha = thresholds.alpha(raw[i]);
+        shares[i] = if raw[i] >= gate[i] { alpha } else { T::ZERO };
+        left[i] = T::multiply_add::<FMA>(-shares[i], before[i], before[i]);
+    }
+    (shares, left)
 }

@@ -19,7 +19,7 @@ use super::super::intersect::TILE;
 use super::super::real::Real;
 use super::View;
 use super::batch::{BATCH, Batch, by_groups};
-use super::splat::{Aligned, BLOCKS, LANES, Lanes, Thresholds, centres, corner, in_blocks};
+use super::splat::{Aligned, BLOCKS, LANES, Lanes, Thresholds, centres, corner, in_blocks, square};
 
 /// Sums per splat before those of its D colours.
 pub(super) const MOMENTS: usize = 6;
@@ -83,7 +83,7 @@ impl<T: Real> GradientTile<T> {
         }
     }
 
-    /// Reads the tile's pixels, and adds its share of the background's gradient, `sum of T_final grad`. Pixels outside
+    /// Reads the tile's pixels, and adds its share of the background's gradient, `sum of T_final grad`, if there is one. Pixels outside
     /// of the image have blended nothing.
     #[inline(always)]
     pub(super) fn load(
@@ -123,9 +123,9 @@ impl<T: Real> GradientTile<T> {
                 let mut behind = -grad[channels];
                 for channel in 0..channels {
                     self.grad[block * channels + channel].0[lane] = grad[channel];
-                    background[channel] += left * grad[channel];
                     if let Some(color) = view.background {
                         behind += color[channel] * grad[channel];
+                        background[channel] += left * grad[channel];
                     }
                 }
                 self.transmittance[block].0[lane] = left;
@@ -189,16 +189,18 @@ impl<T: Real> GradientTile<T> {
     #[inline(always)]
     fn evaluate<const FMA: bool>(&mut self, block: usize, count: usize, corner: [T; 2]) {
         let [xs, ys] = centres(corner, block);
-        for (Aligned(pairs), splat) in self.pairs[..count]
-            .iter_mut()
-            .zip(self.batch.reaching(block))
-        {
-            // Copies, here and below: behind references they might alias what is written, which bars SIMD.
-            let [mut z1, mut z2, mut raw] = [[T::ZERO; LANES]; 3];
+        let pairs = &mut self.pairs[..count];
+        for (Aligned(pairs), splat) in pairs.iter_mut().zip(self.batch.reaching(block)) {
             for i in 0..LANES {
-                (z1[i], z2[i], raw[i]) = splat.at::<FMA>(xs[i], ys[i]);
+                [pairs.z1[i], pairs.z2[i]] = splat.z::<FMA>(xs[i], ys[i]);
             }
-            (pairs.z1, pairs.z2, pairs.raw) = (z1, z2, raw);
+        }
+        // By itself, so that all that an exponential needs stays in registers.
+        for (Aligned(pairs), splat) in pairs.iter_mut().zip(self.batch.reaching(block)) {
+            for i in 0..LANES {
+                let square = square::<T, FMA>([pairs.z1[i], pairs.z2[i]]);
+                pairs.raw[i] = splat.raw::<FMA>(square);
+            }
         }
     }
 

@@ -102,14 +102,20 @@ impl<T: Real> Splat<T> {
         blocks as u16
     }
 
-    /// (z1, z2, raw alpha) at a pixel, z in units of [`UNIT`]. Both passes call it, so both see the same bits.
+    /// z1 and z2 at a pixel, in units of [`UNIT`].
     #[inline(always)]
-    pub(super) fn at<const FMA: bool>(&self, x: T, y: T) -> (T, T, T) {
+    pub(super) fn z<const FMA: bool>(&self, x: T, y: T) -> [T; 2] {
         let (dx, dy) = (x - self.mean[0], y - self.mean[1]);
-        let z1 = self.w11 * dx;
-        let z2 = T::multiply_add::<FMA>(self.w21, dx, self.w22 * dy);
-        let falloff = T::exp2_neg::<FMA>(T::multiply_add::<FMA>(z1, z1, z2 * z2));
-        (z1, z2, self.opacity * falloff)
+        [
+            self.w11 * dx,
+            T::multiply_add::<FMA>(self.w21, dx, self.w22 * dy),
+        ]
+    }
+
+    /// Raw alpha, given `|z|^2`.
+    #[inline(always)]
+    pub(super) fn raw<const FMA: bool>(&self, square: T) -> T {
+        self.opacity * T::exp2_neg::<FMA>(square)
     }
 
     /// Gradients of screen mean, w11, w21, w22, and of the opacity, from a splat's sums of g times 1, z1, z2, z1^2, z1 z2
@@ -155,18 +161,21 @@ pub(super) fn in_blocks(column: usize, row: usize) -> [usize; 2] {
     ]
 }
 
-/// The least of the lanes; halves onto halves.
+/// `|z|^2`. Both passes call it, so both see the same bits.
 #[inline(always)]
-pub(super) fn least<T: Real>(lanes: &Lanes<T>) -> T {
-    let mut least = *lanes;
-    let mut width = LANES;
-    while width > 1 {
-        width /= 2;
-        for i in 0..width {
-            least[i] = least[i].least(least[i + width]);
-        }
+pub(super) fn square<T: Real, const FMA: bool>([z1, z2]: [T; 2]) -> T {
+    T::multiply_add::<FMA>(z1, z1, z2 * z2)
+}
+
+/// Whether any lane passes.
+#[inline(always)]
+pub(super) fn any<V: Copy>(lanes: &Lanes<V>, passes: impl Fn(V) -> bool) -> bool {
+    // One half onto the other, which leaves one register to look at.
+    let mut found = [false; LANES / 2];
+    for i in 0..LANES / 2 {
+        found[i] = passes(lanes[i]) | passes(lanes[i + LANES / 2]);
     }
-    least[0]
+    found.iter().fold(false, |any, found| any | found)
 }
 
 /// The one place that decides what becomes of a (pixel, splat) pair; both passes call it.
