@@ -129,10 +129,15 @@ impl Buffer {
         PendingRead(Box::pin(client.read_async(vec![self.handle.clone()])))
     }
 
+    /// Whether something else holds the memory too.
+    pub(crate) fn is_held(&self) -> bool {
+        !self.handle.can_mut()
+    }
+
     /// For a kernel that reads this buffer as its buffer number `position` and writes a result of the same length: where
     /// that comes, the same memory if nothing else holds it, and the arguments for both.
     pub(crate) fn overwritten(self, client: &Client, position: usize) -> (Self, [BufferArg; 2]) {
-        if self.handle.can_mut() {
+        if !self.is_held() {
             let arguments = [self.arg(), BufferArg::alias(position, self.len.max(1))];
             return (self, arguments);
         }
