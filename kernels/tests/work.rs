@@ -103,16 +103,16 @@ fn results_take_the_memory_of_what_nothing_else_holds() {
         assert!(values.iter().zip(&e).all(close), "{values:?}");
     }
 
-    let two = |values: [f32; 2]| Buffer::from_f32(&client, &values);
-    let step = two([3.0, 4.0]);
-    let extents = two([1.0, 1.0]);
+    let row = |values: [f32; 9]| Buffer::from_f32(&client, &values);
+    let step = row([3.0, 4.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0]);
+    let packed = row([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]);
     let sums = [
         Buffer::from_f32(&client, &[1.0]),
         Buffer::from_f32(&client, &[7.0]),
     ];
     let held = sums[0].clone();
     let before = work();
-    let [lengths, views] = screen_statistics(&client, [&step, &extents], sums, [2.0, 2.0]);
+    let [lengths, views] = screen_statistics(&client, [&step, &packed], sums, [2.0, 2.0]);
     assert_eq!(work().since(before).reserved_bytes, 4, "one sum is held");
     let read = |buffer: Buffer| buffer.read_f32(&client).unwrap();
     assert_eq!([held, lengths, views].map(read), [[1.0], [11.0], [8.0]]);

@@ -6,8 +6,8 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 use splat_ops::device::kernel_work;
 use splat_ops::{
-    ImageSize, ProjectSettings, RasterizeSettings, ScreenStatistics, SsimArgs, exp, photometric,
-    project, rasterize, sh_colors, sigmoid,
+    ImageSize, ProjectSettings, Projected, RasterizeSettings, ScreenStatistics, SsimArgs, exp,
+    photometric, project, rasterize, sh_colors, sigmoid,
 };
 
 fn main() {
@@ -123,26 +123,26 @@ fn time_of_the_ops_beside_project_and_rasterize() {
         };
         measure(&format!("{name}: photometric"), &device, || {
             let measured = photometric(rendered.clone(), levels.clone(), &args).unwrap();
-            let grads = (measured.l1 - measured.ssim).backward();
+            let grads = measured.losses().sum().backward();
             assert!(rendered.grad(&grads).is_some());
         });
 
         let plain = device.clone().inner();
         let packed = Tensor::<3>::from_data(random.data([1, n, 9], -1.0, 1.0), &plain);
+        let size = ImageSize {
+            width: w as u32,
+            height: h as u32,
+        };
+        let projected = Projected::from_packed(packed.clone(), size).unwrap();
         let start = Tensor::<1>::zeros([n], &plain);
         let mut sums = Some(ScreenStatistics {
             gradients: start.clone(),
             views: start,
         });
-        let size = ImageSize {
-            width: w as u32,
-            height: h as u32,
-        };
         measure(&format!("{name}: screen statistics"), &device, || {
-            let [gradient, extents] = [0, 7].map(|first| packed.clone().narrow(2, first, 2));
             sums = sums
                 .take()
-                .map(|sums| sums.add(gradient, extents, size).unwrap());
+                .map(|sums| sums.add(packed.clone(), &projected).unwrap());
         });
     }
 }
