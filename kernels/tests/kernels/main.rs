@@ -14,6 +14,7 @@ mod rasterize;
 mod reference;
 mod scan;
 mod sh;
+mod sh_colors;
 mod sort;
 
 /// Whether kernels use plane operations.

@@ -736,6 +736,12 @@ mod tests {
         let error = builder().loss(constant).build().unwrap().run().unwrap_err();
         assert!(matches!(error, TrainError::Loss(_)), "{error}");
 
+        let two = |_: &TargetView, rendered: &splat_model::ops::Rendered| {
+            Ok(rendered.alpha().mean().repeat_dim(0, 2))
+        };
+        let error = builder().loss(two).build().unwrap().run().unwrap_err();
+        assert!(error.to_string().contains("one for each name"), "{error}");
+
         let not_a_number = |_: &TargetView, rendered: &splat_model::ops::Rendered| {
             Ok(rendered.image().mean() * f64::NAN)
         };
