@@ -3,14 +3,16 @@
 //! ```text
 //! m = beta_1 m + (1 - beta_1) g,   v = beta_2 v + (1 - beta_2) g²,   p = p - rate m / (√v + epsilon)
 //! ```
-//! A gradient whose square is not finite counts as zero.
+//! A gradient whose square is not finite counts as zero. Parameter and moments are written where they are read, if
+//! nothing else holds their memory.
 //!
-//! Floor per value: 16 bytes read, 12 written, about 12 operations: bound by memory.
+//! Floor per value: 16 bytes read, 12 written, about 12 operations: bound by memory. Of a row that takes no step, 4 read.
 
 use cubecl::prelude::*;
 
 use crate::floor::{Bytes, Sizes};
-use crate::launch::{Buffer, per_element};
+use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
+use crate::math::is_finite;
 
 /// The numbers of one step; the bias corrections are in `rate` and `epsilon`.
 #[derive(Clone, Copy, Debug)]
@@ -23,6 +25,20 @@ pub struct AdamStep {
     pub rate: f64,
     /// Added to the root of the second moment; epsilon times `sqrt(1 - beta_2^t)`.
     pub epsilon: f64,
+    /// Which rows take the step.
+    pub rows: AdamRows,
+}
+
+/// Which rows of a parameter take a step.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum AdamRows {
+    /// All.
+    All,
+    /// Those whose gradient is not all zero, NaN counting as zero; the others keep parameter and moments.
+    Seen {
+        /// Values per row.
+        width: usize,
+    },
 }
 
 /// Weights of the old moments and of what is new, in this order; rate; epsilon.
@@ -35,6 +51,27 @@ struct Numbers {
     take_2: f32,
     rate: f32,
     epsilon: f32,
+}
+
+/// Parameter and both moments of one value after the step.
+#[derive(CubeType, Clone, Copy)]
+#[expand(derive(Clone, Copy))]
+struct Stepped {
+    param: f32,
+    moment_1: f32,
+    moment_2: f32,
+}
+
+#[cube]
+fn stepped(param: f32, grad: f32, moment_1: f32, moment_2: f32, numbers: Numbers) -> Stepped {
+    let g = select(is_finite(grad * grad), grad, 0.0f32);
+    let m = moment_1 * numbers.keep_1 + g * numbers.take_1;
+    let v = moment_2 * numbers.keep_2 + g * g * numbers.take_2;
+    Stepped {
+        param: param - m / (f32::sqrt(v) + numbers.epsilon) * numbers.rate,
+        moment_1: m,
+        moment_2: v,
+    }
 }
 
 #[cube(launch)]
@@ -51,14 +88,71 @@ fn adam_values(
 ) {
     let i = ABSOLUTE_POS;
     if i < len as usize {
-        let g = grad[i];
-        let usable = g * g <= f32::MAX;
-        let g = select(usable, g, 0.0f32);
-        let m = moment_1[i] * numbers.keep_1 + g * numbers.take_1;
-        let v = moment_2[i] * numbers.keep_2 + g * g * numbers.take_2;
-        param_out[i] = param[i] - m / (f32::sqrt(v) + numbers.epsilon) * numbers.rate;
-        moment_1_out[i] = m;
-        moment_2_out[i] = v;
+        let after = stepped(param[i], grad[i], moment_1[i], moment_2[i], numbers);
+        param_out[i] = after.param;
+        moment_1_out[i] = after.moment_1;
+        moment_2_out[i] = after.moment_2;
+    }
+}
+
+/// Neither of the zeros nor NaN, by the bits: a device may take the smallest numbers for zero.
+#[cube]
+fn is_seen(grad: f32) -> bool {
+    let magnitude = u32::reinterpret(grad) & 0x7fff_ffffu32;
+    magnitude > 0u32 && magnitude <= 0x7f80_0000u32
+}
+
+/// Each workgroup has `rows` whole rows, at most as many as it has units. `copied`: which of the results lie elsewhere
+/// than what they are made of, so that what stays as it was must be written too.
+#[cube(launch)]
+fn adam_seen_rows(
+    param: &[f32],
+    grad: &[f32],
+    moment_1: &[f32],
+    moment_2: &[f32],
+    param_out: &mut [f32],
+    moment_1_out: &mut [f32],
+    moment_2_out: &mut [f32],
+    numbers: Numbers,
+    len: u32,
+    width: u32,
+    rows: u32,
+    #[comptime] copied: [bool; 3],
+) {
+    let seen = Shared::<[Atomic<u32>]>::new_slice(CUBE_UNITS_USIZE);
+    let unit = UNIT_POS as usize;
+    let width = width as usize;
+    Atomic::store(&seen[unit], 0u32);
+    sync_cube();
+    let from = CUBE_POS * rows as usize * width;
+    let to = min(from + rows as usize * width, len as usize);
+    let mut i = from + unit;
+    while i < to {
+        if is_seen(grad[i]) {
+            Atomic::store(&seen[(i - from) / width], 1u32);
+        }
+        i += CUBE_UNITS_USIZE;
+    }
+    sync_cube();
+    let mut i = from + unit;
+    while i < to {
+        if Atomic::load(&seen[(i - from) / width]) != 0u32 {
+            let after = stepped(param[i], grad[i], moment_1[i], moment_2[i], numbers);
+            param_out[i] = after.param;
+            moment_1_out[i] = after.moment_1;
+            moment_2_out[i] = after.moment_2;
+        } else {
+            if comptime!(copied[0]) {
+                param_out[i] = param[i];
+            }
+            if comptime!(copied[1]) {
+                moment_1_out[i] = moment_1[i];
+            }
+            if comptime!(copied[2]) {
+                moment_2_out[i] = moment_2[i];
+            }
+        }
+        i += CUBE_UNITS_USIZE;
     }
 }
 
@@ -71,33 +165,97 @@ pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     }
 }
 
-/// Parameter, gradient and both moments, all of one length, to parameter and moments after the step.
-pub fn adam(client: &Client, tensors: [&Buffer; 4], step: &AdamStep) -> [Buffer; 3] {
-    let [param, grad, moment_1, moment_2] = tensors;
-    let len = tensors.map(Buffer::len).into_iter().min().unwrap_or(0);
-    let out = [(); 3].map(|()| Buffer::empty(client, len));
+/// Steps a parameter and its moments, given the gradient; all of one length.
+pub fn adam(
+    client: &Client,
+    param: Buffer,
+    grad: &Buffer,
+    moments: [Buffer; 2],
+    step: &AdamStep,
+) -> [Buffer; 3] {
+    let [moment_1, moment_2] = moments;
+    let buffers = [param, moment_1, moment_2];
+    let lens = buffers.each_ref().map(Buffer::len);
+    let len = lens.into_iter().fold(grad.len(), usize::min);
+    let copied = buffers.each_ref().map(Buffer::is_held);
+    let [param, moment_1, moment_2] = buffers;
+    let (param, [param_in, param_out]) = param.overwritten(client, 0);
+    let (moment_1, [moment_1_in, moment_1_out]) = moment_1.overwritten(client, 2);
+    let (moment_2, [moment_2_in, moment_2_out]) = moment_2.overwritten(client, 3);
+    let inputs = [param_in, grad.arg(), moment_1_in, moment_2_in];
+    let outputs = [param_out, moment_1_out, moment_2_out];
+    match step.rows {
+        AdamRows::All => all_rows(client, inputs, outputs, step, len),
+        AdamRows::Seen { width } => {
+            seen_rows(client, inputs, outputs, step, [len, width.max(1)], copied);
+        }
+    }
+    [param, moment_1, moment_2]
+}
+
+fn numbers(step: &AdamStep) -> NumbersLaunch {
+    NumbersLaunch::new(
+        step.beta_1 as f32,
+        (1.0 - step.beta_1) as f32,
+        step.beta_2 as f32,
+        (1.0 - step.beta_2) as f32,
+        step.rate as f32,
+        step.epsilon as f32,
+    )
+}
+
+fn all_rows(
+    client: &Client,
+    [param, grad, moment_1, moment_2]: [BufferArg; 4],
+    [param_out, moment_1_out, moment_2_out]: [BufferArg; 3],
+    step: &AdamStep,
+    len: usize,
+) {
     if let Some((count, dim)) = per_element(len) {
         adam_values::launch(
             client,
             count,
             dim,
-            param.arg(),
-            grad.arg(),
-            moment_1.arg(),
-            moment_2.arg(),
-            out[0].arg(),
-            out[1].arg(),
-            out[2].arg(),
-            NumbersLaunch::new(
-                step.beta_1 as f32,
-                (1.0 - step.beta_1) as f32,
-                step.beta_2 as f32,
-                (1.0 - step.beta_2) as f32,
-                step.rate as f32,
-                step.epsilon as f32,
-            ),
+            param,
+            grad,
+            moment_1,
+            moment_2,
+            param_out,
+            moment_1_out,
+            moment_2_out,
+            numbers(step),
             len as u32,
         );
     }
-    out
+}
+
+fn seen_rows(
+    client: &Client,
+    [param, grad, moment_1, moment_2]: [BufferArg; 4],
+    [param_out, moment_1_out, moment_2_out]: [BufferArg; 3],
+    step: &AdamStep,
+    [len, width]: [usize; 2],
+    copied: [bool; 3],
+) {
+    if len == 0 {
+        return;
+    }
+    let rows = (CUBE_UNITS_USIZE / width).max(1);
+    adam_seen_rows::launch(
+        client,
+        cube_count(len.div_ceil(rows * width)),
+        CubeDim::new_1d(CUBE_UNITS),
+        param,
+        grad,
+        moment_1,
+        moment_2,
+        param_out,
+        moment_1_out,
+        moment_2_out,
+        numbers(step),
+        len as u32,
+        width as u32,
+        rows as u32,
+        copied,
+    );
 }

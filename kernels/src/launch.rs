@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use cubecl::bytes::Bytes;
 use cubecl::future::reader::try_read_sync;
+use cubecl::ir::{ElemType, FloatKind};
 use cubecl::prelude::*;
 use cubecl::server::{Handle, ServerError};
 
@@ -129,10 +130,15 @@ impl Buffer {
         PendingRead(Box::pin(client.read_async(vec![self.handle.clone()])))
     }
 
+    /// Whether something else holds the memory too.
+    pub(crate) fn is_held(&self) -> bool {
+        !self.handle.can_mut()
+    }
+
     /// For a kernel that reads this buffer as its buffer number `position` and writes a result of the same length: where
     /// that comes, the same memory if nothing else holds it, and the arguments for both.
     pub(crate) fn overwritten(self, client: &Client, position: usize) -> (Self, [BufferArg; 2]) {
-        if self.handle.can_mut() {
+        if !self.is_held() {
             let arguments = [self.arg(), BufferArg::alias(position, self.len.max(1))];
             return (self, arguments);
         }
@@ -148,6 +154,49 @@ impl Buffer {
         unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len.max(1)) }
     }
 }
+
+/// A device buffer of `len` floats of half precision, contiguous. Kernels read it where the device can.
+#[derive(Clone, Debug)]
+pub struct HalfBuffer {
+    handle: Handle,
+    len: usize,
+}
+
+impl HalfBuffer {
+    /// Wraps a contiguous `handle` that holds at least `len` elements of two bytes.
+    ///
+    /// # Errors
+    /// Gives the handle back if it is smaller than that.
+    pub fn new(handle: Handle, len: usize) -> Result<Self, Handle> {
+        if len > 0 && handle.size_in_used() / 2 >= len as u64 {
+            Ok(Self { handle, len })
+        } else {
+            Err(handle)
+        }
+    }
+
+    /// Elements; never none.
+    #[allow(clippy::len_without_is_empty)]
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// The buffer as a kernel argument, to be viewed as `f16`.
+    pub(crate) fn arg(&self) -> BufferArg {
+        // SAFETY: the constructor makes sure that the handle holds `len` elements of two bytes.
+        unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len) }
+    }
+}
+
+/// Whether kernels on this device can read half precision.
+pub fn reads_half(client: &Client) -> bool {
+    client.properties().supports_type(F16)
+}
+
+/// The type of single precision, for kernels that are made for several.
+pub(crate) const F32: ElemType = ElemType::Float(FloatKind::F32);
+/// That of half precision.
+pub(crate) const F16: ElemType = ElemType::Float(FloatKind::F16);
 
 /// Elements on their way to the host.
 pub(crate) struct PendingRead<'a>(

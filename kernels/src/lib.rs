@@ -40,7 +40,7 @@ mod work;
 pub use describe::describe;
 #[doc(hidden)]
 pub use launch::poison;
-pub use launch::{Buffer, CUBE_UNITS};
+pub use launch::{Buffer, CUBE_UNITS, HalfBuffer, reads_half};
 #[doc(hidden)]
 pub use planes::force_plane_size;
 pub use planes::plane_size;

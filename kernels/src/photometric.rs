@@ -391,11 +391,11 @@ fn means_of_tiles(partials: &[f32], means: &mut [f32], tiles: u32, l1: f32, ssim
     let similarity = sum_units(&mut shared, similarity, CUBE_UNITS_USIZE);
     if UNIT_POS == 0 {
         means[0] = difference * l1;
-        means[1] = similarity * ssim;
+        means[1] = 1.0f32 - similarity * ssim;
     }
 }
 
-/// Mean absolute difference and mean similarity `[2]`. `shape` must fit.
+/// Mean absolute difference, and one less the mean similarity: `[2]`. `shape` must fit.
 pub fn photometric(client: &Client, images: Images, shape: &PhotometricShape) -> Buffer {
     measure(client, images, shape, false).0
 }
@@ -514,7 +514,7 @@ fn photometric_gradient(
     down_column(&shared, 1usize, &window, &mut by_squares, taps);
     down_column(&shared, 2usize, &window, &mut by_product, taps);
     let l1 = grad[0] * weight;
-    let ssim = grad[1];
+    let ssim = -grad[1];
     let x = place.x + UNIT_POS % TILE_WIDTH as u32;
     let first = place.y + UNIT_POS / TILE_WIDTH as u32 * RUN as u32;
     #[unroll]

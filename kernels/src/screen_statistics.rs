@@ -4,6 +4,8 @@
 //! A gradient whose length is not finite counts as zero, so that it does not hide the other views. One unit adds all
 //! cameras of one Gaussian, in order.
 //!
+//! Gradients and extents are read out of the rows of packed splats, where they lie.
+//!
 //! Floor per Gaussian: 8 bytes read and 8 written, and 12 read and 6 operations for every camera.
 
 use cubecl::prelude::*;
@@ -11,6 +13,10 @@ use cubecl::prelude::*;
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 use crate::math::is_finite;
+use crate::project::PACKED;
+
+/// Column of packed splats that has the extent along x.
+const EXTENT: usize = 7;
 
 /// What the sums of one camera must move.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
@@ -23,7 +29,7 @@ pub(crate) fn floor(sizes: &Sizes) -> Bytes {
 #[cube(launch)]
 fn add_screen_statistics(
     gradient: &[f32],
-    extents: &[f32],
+    packed: &[f32],
     lengths: &[f32],
     views: &[f32],
     lengths_out: &mut [f32],
@@ -39,8 +45,8 @@ fn add_screen_statistics(
         let mut sum = 0.0f32;
         let mut count = 0.0f32;
         for camera in 0..cameras as usize {
-            let at = (camera * gaussians + gaussian) * 2;
-            if extents[at] > 0.0f32 {
+            let at = (camera * gaussians + gaussian) * PACKED;
+            if packed[at + EXTENT] > 0.0f32 {
                 let x = gradient[at] * half_width;
                 let y = gradient[at + 1] * half_height;
                 let length = f32::sqrt(x * x + y * y);
@@ -53,17 +59,17 @@ fn add_screen_statistics(
     }
 }
 
-/// Gradients of screen means and extents, both `[C, N, 2]`, and sums of lengths and of views, both `[N]`, to these sums
+/// Gradients of packed splats and these themselves, both `[C, N, 9]`, and sums of lengths and of views, both `[N]`, to these sums
 /// with the lengths of `half * gradient` and the views added: in their own memory, where nothing else holds it.
 pub fn screen_statistics(
     client: &Client,
-    [gradient, extents]: [&Buffer; 2],
+    [gradient, packed]: [&Buffer; 2],
     sums: [Buffer; 2],
     half: [f32; 2],
 ) -> [Buffer; 2] {
     let [lengths, views] = sums;
     let gaussians = lengths.len().min(views.len());
-    let cameras = gradient.len().min(extents.len()) / (2 * gaussians.max(1));
+    let cameras = gradient.len().min(packed.len()) / (PACKED * gaussians.max(1));
     let (lengths, [lengths_in, lengths_out]) = lengths.overwritten(client, 2);
     let (views, [views_in, views_out]) = views.overwritten(client, 3);
     if let Some((count, dim)) = per_element(gaussians) {
@@ -72,7 +78,7 @@ pub fn screen_statistics(
             count,
             dim,
             gradient.arg(),
-            extents.arg(),
+            packed.arg(),
             lengths_in,
             views_in,
             lengths_out,

@@ -11,10 +11,13 @@
 //! written and about 9 K + 25 operations. Gradients: 12 + 12 K read and for every camera 12; 12 + 12 K written; for
 //! every camera about 24 K + 40 operations. Gradients of centres, if wanted, read and compute that once more.
 
+use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 
 use crate::floor::{Bytes, Sizes};
-use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
+use crate::launch::{
+    Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, F16, F32, HalfBuffer, cube_count, per_element,
+};
 use crate::math::{Vec3, is_below_zero};
 use crate::reduce::{sum_blocks, sum_units};
 use crate::sh::{basis, direction_vjp, functions, guarded_dot, inverse_length, usable_degree};
@@ -40,13 +43,31 @@ pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     ]
 }
 
+/// Coefficients of the higher degrees [N, R, 3], as they are stored. All sums are of single precision.
+#[derive(Clone, Debug)]
+pub enum ShRest {
+    /// In single precision.
+    Exact(Buffer),
+    /// In half precision: half of the bytes, for a relative error of up to 2^-11 each.
+    Half(HalfBuffer),
+}
+
+impl ShRest {
+    fn len(&self) -> usize {
+        match self {
+            Self::Exact(values) => values.len(),
+            Self::Half(values) => values.len(),
+        }
+    }
+}
+
 /// What the colours are made of.
 #[derive(Clone, Debug)]
 pub struct ShInputs {
     /// Coefficients of degree 0 [N, 1, 3].
     pub sh0: Buffer,
     /// Those of the higher degrees [N, R, 3], if there are any.
-    pub sh_rest: Option<Buffer>,
+    pub sh_rest: Option<ShRest>,
     /// R.
     pub stored: usize,
     /// World positions [N, 3].
@@ -73,8 +94,12 @@ impl ShInputs {
     }
 
     /// Something to bind in place of coefficients that are not read.
-    fn rest(&self) -> &Buffer {
-        self.sh_rest.as_ref().unwrap_or(&self.sh0)
+    fn rest(&self) -> (BufferArg, ElemType) {
+        match &self.sh_rest {
+            Some(ShRest::Exact(values)) => (values.arg(), F32),
+            Some(ShRest::Half(values)) => (values.arg(), F16),
+            None => (self.sh0.arg(), F32),
+        }
     }
 }
 
@@ -96,11 +121,20 @@ fn sight(means: &[f32], centers: &[f32], gaussian: usize, camera: usize) -> Sigh
     }
 }
 
+#[cube]
+fn coefficient<R: Float>(rest: &[R], at: usize) -> Vec3 {
+    Vec3::new(
+        f32::cast_from(rest[at]),
+        f32::cast_from(rest[at + 1]),
+        f32::cast_from(rest[at + 2]),
+    )
+}
+
 /// The colour before the clamp. Fused multiply-adds are spelled out, so that the gradient finds the same sign.
 #[cube]
-fn unclamped(
+fn unclamped<R: Float>(
     sh0: &[f32],
-    rest: &[f32],
+    rest: &[R],
     y: &Array<f32>,
     gaussian: usize,
     stored: usize,
@@ -113,7 +147,7 @@ fn unclamped(
     let from = gaussian * stored * 3;
     #[unroll]
     for k in 1..comptime!(functions(degree)) {
-        let coefficient = Vec3::load(rest, from + (k - 1) * 3);
+        let coefficient = coefficient::<R>(rest, from + (k - 1) * 3);
         red = fma(y[k], coefficient.x, red);
         green = fma(y[k], coefficient.y, green);
         blue = fma(y[k], coefficient.z, blue);
@@ -128,9 +162,9 @@ fn clamped(value: f32) -> f32 {
 }
 
 #[cube(launch)]
-fn sh_colors_forward(
+fn sh_colors_forward<R: Float>(
     sh0: &[f32],
-    rest: &[f32],
+    rest: &[R],
     means: &[f32],
     centers: &[f32],
     colors: &mut [f32],
@@ -138,6 +172,7 @@ fn sh_colors_forward(
     cameras: u32,
     stored: u32,
     #[comptime] degree: usize,
+    #[define(R)] _stored_as: ElemType,
 ) {
     let gaussians = gaussians as usize;
     let index = ABSOLUTE_POS;
@@ -146,7 +181,7 @@ fn sh_colors_forward(
         let sight = sight(means, centers, gaussian, index / gaussians);
         let mut y = Array::<f32>::new(comptime!(functions(degree)));
         basis(sight.unit, &mut y, degree);
-        let color = unclamped(sh0, rest, &y, gaussian, stored as usize, degree);
+        let color = unclamped::<R>(sh0, rest, &y, gaussian, stored as usize, degree);
         Vec3::new(clamped(color.x), clamped(color.y), clamped(color.z)).store(colors, index * 3);
     }
 }
@@ -155,13 +190,14 @@ fn sh_colors_forward(
 pub fn sh_colors(client: &Client, inputs: &ShInputs, degree: usize) -> Buffer {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
     let colors = Buffer::empty(client, cameras * gaussians * 3);
+    let (rest, stored_as) = inputs.rest();
     if let Some((count, dim)) = per_element(cameras * gaussians) {
         sh_colors_forward::launch(
             client,
             count,
             dim,
             inputs.sh0.arg(),
-            inputs.rest().arg(),
+            rest,
             inputs.means.arg(),
             inputs.centers.arg(),
             colors.arg(),
@@ -169,6 +205,7 @@ pub fn sh_colors(client: &Client, inputs: &ShInputs, degree: usize) -> Buffer {
             cameras as u32,
             inputs.stored as u32,
             inputs.degree(degree),
+            stored_as,
         );
     }
     colors
@@ -186,8 +223,8 @@ fn passed_on(color: Vec3, g: Vec3) -> Vec3 {
 
 /// The gradient of the direction, given that of the colour before the clamp.
 #[cube]
-fn sight_vjp(
-    rest: &[f32],
+fn sight_vjp<R: Float>(
+    rest: &[R],
     sight: Sight,
     g: Vec3,
     gaussian: usize,
@@ -200,16 +237,16 @@ fn sight_vjp(
     let from = gaussian * stored * 3;
     #[unroll]
     for k in 1..comptime!(functions(degree)) {
-        weights[k] = guarded_dot(g, Vec3::load(rest, from + (k - 1) * 3));
+        weights[k] = guarded_dot(g, coefficient::<R>(rest, from + (k - 1) * 3));
     }
     direction_vjp(sight.unit, sight.inverse, &weights, degree)
 }
 
 /// Gradients of Gaussians, summed over cameras; zero for coefficients that are not read.
 #[cube(launch)]
-fn sh_colors_backward_gaussians(
+fn sh_colors_backward_gaussians<R: Float>(
     sh0: &[f32],
-    rest: &[f32],
+    rest: &[R],
     means: &[f32],
     centers: &[f32],
     grad_colors: &[f32],
@@ -221,6 +258,7 @@ fn sh_colors_backward_gaussians(
     stored: u32,
     #[comptime] degree: usize,
     #[comptime] wanted: [bool; 3],
+    #[define(R)] _stored_as: ElemType,
 ) {
     let gaussians = gaussians as usize;
     let stored = stored as usize;
@@ -241,7 +279,7 @@ fn sh_colors_backward_gaussians(
             if g.max_abs() != 0.0f32 {
                 let sight = sight(means, centers, gaussian, camera);
                 basis(sight.unit, &mut y, degree);
-                let color = unclamped(sh0, rest, &y, gaussian, stored, degree);
+                let color = unclamped::<R>(sh0, rest, &y, gaussian, stored, degree);
                 let g = passed_on(color, g);
                 if comptime!(wanted[0] || wanted[1]) {
                     #[unroll]
@@ -252,7 +290,7 @@ fn sh_colors_backward_gaussians(
                     }
                 }
                 if comptime!(wanted[2]) {
-                    let grad = sight_vjp(rest, sight, g, gaussian, stored, degree);
+                    let grad = sight_vjp::<R>(rest, sight, g, gaussian, stored, degree);
                     mean_x += grad.x;
                     mean_y += grad.y;
                     mean_z += grad.z;
@@ -280,9 +318,9 @@ fn sh_colors_backward_gaussians(
 
 /// Gradients of centres: `partials[camera, block]` = sum over the Gaussians of the block.
 #[cube(launch)]
-fn sh_colors_backward_centers(
+fn sh_colors_backward_centers<R: Float>(
     sh0: &[f32],
-    rest: &[f32],
+    rest: &[R],
     means: &[f32],
     centers: &[f32],
     grad_colors: &[f32],
@@ -292,6 +330,7 @@ fn sh_colors_backward_centers(
     blocks: u32,
     stored: u32,
     #[comptime] degree: usize,
+    #[define(R)] _stored_as: ElemType,
 ) {
     let mut shared = Shared::new_slice(CUBE_UNITS_USIZE);
     let gaussians = gaussians as usize;
@@ -311,9 +350,9 @@ fn sh_colors_backward_centers(
                     let sight = sight(means, centers, gaussian, camera);
                     let mut values = Array::<f32>::new(comptime!(functions(degree)));
                     basis(sight.unit, &mut values, degree);
-                    let color = unclamped(sh0, rest, &values, gaussian, stored, degree);
+                    let color = unclamped::<R>(sh0, rest, &values, gaussian, stored, degree);
                     let g = passed_on(color, g);
-                    let grad = sight_vjp(rest, sight, g, gaussian, stored, degree);
+                    let grad = sight_vjp::<R>(rest, sight, g, gaussian, stored, degree);
                     x -= grad.x;
                     y -= grad.y;
                     z -= grad.z;
@@ -347,12 +386,13 @@ pub fn sh_colors_backward(
     if wanted[..3].contains(&true)
         && let Some((count, dim)) = per_element(gaussians)
     {
+        let (rest, stored_as) = inputs.rest();
         sh_colors_backward_gaussians::launch(
             client,
             count,
             dim,
             inputs.sh0.arg(),
-            inputs.rest().arg(),
+            rest,
             inputs.means.arg(),
             inputs.centers.arg(),
             grad_colors.arg(),
@@ -364,18 +404,20 @@ pub fn sh_colors_backward(
             inputs.stored as u32,
             degree,
             [wanted[0], wanted[1], wanted[2]],
+            stored_as,
         );
     }
     let of_centers = wanted[3].then(|| {
         let blocks = gaussians.div_ceil(CENTER_BLOCK);
         let partials = Buffer::empty(client, cameras * blocks * 3);
         if !partials.is_empty() {
+            let (rest, stored_as) = inputs.rest();
             sh_colors_backward_centers::launch(
                 client,
                 cube_count(cameras * blocks),
                 CubeDim::new_1d(CUBE_UNITS),
                 inputs.sh0.arg(),
-                inputs.rest().arg(),
+                rest,
                 inputs.means.arg(),
                 inputs.centers.arg(),
                 grad_colors.arg(),
@@ -385,6 +427,7 @@ pub fn sh_colors_backward(
                 blocks as u32,
                 inputs.stored as u32,
                 degree,
+                stored_as,
             );
         }
         sum_blocks(client, &partials, [cameras, blocks, 3])

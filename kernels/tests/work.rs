@@ -8,6 +8,7 @@ mod alone;
 use alone::alone;
 use cubecl::client::Client;
 use splat_kernels::activation::{Activation, activate};
+use splat_kernels::adam::{AdamRows, AdamStep, adam};
 use splat_kernels::intersect::Frames;
 use splat_kernels::rasterize::{RasterizeInputs, RasterizeSettings, rasterize};
 use splat_kernels::screen_statistics::screen_statistics;
@@ -102,17 +103,55 @@ fn results_take_the_memory_of_what_nothing_else_holds() {
         assert!(values.iter().zip(&e).all(close), "{values:?}");
     }
 
-    let two = |values: [f32; 2]| Buffer::from_f32(&client, &values);
-    let step = two([3.0, 4.0]);
-    let extents = two([1.0, 1.0]);
+    let row = |values: [f32; 9]| Buffer::from_f32(&client, &values);
+    let step = row([3.0, 4.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0]);
+    let packed = row([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0]);
     let sums = [
         Buffer::from_f32(&client, &[1.0]),
         Buffer::from_f32(&client, &[7.0]),
     ];
     let held = sums[0].clone();
     let before = work();
-    let [lengths, views] = screen_statistics(&client, [&step, &extents], sums, [2.0, 2.0]);
+    let [lengths, views] = screen_statistics(&client, [&step, &packed], sums, [2.0, 2.0]);
     assert_eq!(work().since(before).reserved_bytes, 4, "one sum is held");
     let read = |buffer: Buffer| buffer.read_f32(&client).unwrap();
     assert_eq!([held, lengths, views].map(read), [[1.0], [11.0], [8.0]]);
+}
+
+/// Training gives parameters and moments away, so a step of Adam takes no memory at all.
+#[test]
+fn a_step_of_adam_takes_no_memory_but_for_what_something_else_holds() {
+    let Some((_guard, client)) = alone() else {
+        return;
+    };
+    let grad = Buffer::from_f32(&client, &[1.0; 6]);
+    for rows in [AdamRows::All, AdamRows::Seen { width: 3 }] {
+        let step = AdamStep {
+            beta_1: 0.5,
+            beta_2: 0.5,
+            rate: 1.0,
+            epsilon: 0.0,
+            rows,
+        };
+        let three = || [(); 3].map(|()| Buffer::from_f32(&client, &[0.0; 6]));
+        let reserved = |[param, moment_1, moment_2]: [Buffer; 3]| {
+            let before = work();
+            let after = adam(&client, param, &grad, [moment_1, moment_2], &step);
+            let done = work().since(before);
+            assert_eq!(done.launches, 1);
+            let expected = [-f32::sqrt(0.5), 0.5, 0.5];
+            for (after, expected) in after.iter().zip(expected) {
+                for value in after.read_f32(&client).unwrap() {
+                    assert!((value - expected).abs() < 1e-6, "{value} {expected}");
+                }
+            }
+            done.reserved_bytes
+        };
+        assert_eq!(reserved(three()), 0, "{rows:?}: given away");
+        let held = three();
+        assert_eq!(reserved(held.clone()), 3 * 24, "{rows:?}: held");
+        for held in held {
+            assert_eq!(held.read_f32(&client).unwrap(), [0.0; 6]);
+        }
+    }
 }

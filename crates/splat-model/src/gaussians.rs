@@ -1,7 +1,8 @@
 //! The model: a set of 3D Gaussians as a Burn module (3DGS section 4).
 
 use burn::module::{Module, Param};
-use burn::tensor::{Device, Tensor, TensorData};
+use burn::tensor::{DType, Device, Tensor, TensorData};
+use splat_ops::device::reads_half;
 use splat_ops::{OpError, SH_DEGREE_MAX, exp, sh_coefficient_count, sh_colors, sigmoid};
 
 use crate::files::SplatData;
@@ -27,6 +28,21 @@ pub struct Gaussians {
     /// Spherical harmonics of the higher degrees, `[N, (degree + 1)^2 - 1, 3]`; absent for degree 0.
     pub sh_rest: Option<Param<Tensor<3>>>,
 }
+
+/// How the coefficients of the higher degrees of spherical harmonics are stored: 45 of the 59 floats of a Gaussian of
+/// degree 3.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ShPrecision {
+    /// In single precision.
+    #[default]
+    Exact,
+    /// In half precision, for rendering: 146 bytes for a Gaussian instead of 236, of which colours read 114 instead of
+    /// 204. `docs/ACCURACY.md` has the error.
+    Half,
+}
+
+/// Largest number of half precision.
+const HALF_MAX: f32 = 65_504.0;
 
 impl Gaussians {
     /// None at all.
@@ -80,6 +96,29 @@ impl Gaussians {
                 .as_ref()
                 .map_or_else(Vec::new, |rest| host(rest.val())),
             sh_degree: self.sh_degree(),
+        }
+    }
+
+    /// The same scene, its higher degrees stored as asked for; from half precision there is no way back. They are
+    /// constants then: a model to be trained stays exact. It also stays as it is where the device's kernels do not read
+    /// half precision (no CPU does it to gain), and where a coefficient is too large for it.
+    #[must_use]
+    pub fn with_sh_precision(mut self, precision: ShPrecision) -> Self {
+        if let (ShPrecision::Half, Some(rest)) = (precision, &self.sh_rest) {
+            let values = rest.val().set_require_grad(false);
+            let fits = || values.clone().abs().max().into_scalar::<f32>() <= HALF_MAX;
+            if reads_half(&values.device()) && !self.is_empty() && fits() {
+                self.sh_rest = Some(Param::initialized(rest.id, values.cast(DType::F16)));
+            }
+        }
+        self
+    }
+
+    /// How the coefficients of the higher degrees are stored.
+    pub fn sh_precision(&self) -> ShPrecision {
+        match self.sh_rest.as_ref().map(|rest| rest.val().dtype()) {
+            Some(DType::F16) => ShPrecision::Half,
+            _ => ShPrecision::Exact,
         }
     }
 
@@ -138,4 +177,64 @@ pub(crate) fn host<const R: usize>(tensor: Tensor<R>) -> Vec<f32> {
 
 fn rows<const W: usize>(tensor: Tensor<2>) -> Vec<[f32; W]> {
     host(tensor).as_chunks().0.to_vec()
+}
+
+#[cfg(all(test, feature = "cpu"))]
+mod tests {
+    use super::*;
+
+    fn scene(rest: f32) -> SplatData {
+        SplatData {
+            means: vec![[0.0; 3]; 3],
+            log_scales: vec![[0.0; 3]; 3],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]; 3],
+            opacity_logits: vec![0.0; 3],
+            sh0: vec![[0.5; 3]; 3],
+            sh_rest: vec![rest; 3 * 9],
+            sh_degree: 1,
+            ..SplatData::default()
+        }
+    }
+
+    #[test]
+    fn half_precision_is_for_devices_that_read_it_and_for_numbers_that_fit() {
+        let mut devices = vec![Device::flex()];
+        #[cfg(feature = "wgpu")]
+        match Device::wgpu_options().init() {
+            Ok(device) => devices.push(device),
+            Err(error) => eprintln!("\n*** SKIPPED: no wgpu adapter: {error} ***\n"),
+        }
+        let colors = |gaussians: &Gaussians, device: &Device| {
+            let colors = gaussians.colors(Tensor::<2>::ones([1, 3], device), 1);
+            host(colors.unwrap())
+        };
+        for device in devices {
+            let third = scene(1.0 / 3.0);
+            let exact = Gaussians::from_data(&third, &device);
+            let half = exact.clone().with_sh_precision(ShPrecision::Half);
+            let reads = reads_half(&device);
+            let expected = [ShPrecision::Exact, ShPrecision::Half][usize::from(reads)];
+            assert_eq!(half.sh_precision(), expected, "{device:?}");
+            let [a, b] = [&exact, &half].map(|gaussians| colors(gaussians, &device));
+            let error = a.iter().zip(&b).map(|(a, b)| (a - b).abs());
+            let error = error.fold(0.0, f32::max);
+            assert!(
+                error < 1e-3 && (error > 0.0) == reads,
+                "{device:?}: {error}"
+            );
+            let kept = half.to_data();
+            assert_eq!(kept.sh0, third.sh0);
+            let rounded = if reads { 0.333_251_95 } else { 1.0 / 3.0 };
+            assert_eq!(kept.sh_rest, vec![rounded; 27], "{device:?}");
+
+            for scene in [scene(65_600.0), SplatData::default()] {
+                let kept = Gaussians::from_data(&scene, &device);
+                let kept = kept.with_sh_precision(ShPrecision::Half);
+                assert_eq!(kept.sh_precision(), ShPrecision::Exact, "{device:?}");
+                assert_eq!(kept.to_data(), scene);
+            }
+            let same = exact.clone().with_sh_precision(ShPrecision::Exact);
+            assert_eq!(same.to_data(), third);
+        }
+    }
 }

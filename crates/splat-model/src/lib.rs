@@ -13,7 +13,7 @@ mod render;
 
 pub use adam::{EditLog, RowEdit, SplatAdam};
 pub use camera::{Camera, CameraTensors};
-pub use gaussians::Gaussians;
+pub use gaussians::{Gaussians, ShPrecision};
 pub use init::{InitError, InitSettings, scene_origin, scene_scale, splats_from_points};
 pub use rates::{Field, LearningRates, splat_optimizer};
 pub use render::{RenderSettings, project_gaussians, render, render_projected};

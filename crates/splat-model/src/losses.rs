@@ -74,7 +74,7 @@ pub fn ssim(
     target: Tensor<4>,
     settings: &SsimSettings,
 ) -> Result<Tensor<1>, OpError> {
-    Ok(photometric(image, target, &settings.args())?.ssim)
+    Ok(photometric(image, target, &settings.args())?.ssim())
 }
 
 #[cfg(all(test, feature = "cpu"))]

@@ -73,10 +73,18 @@ pub fn render_projected(
         let color = Tensor::<1>::from_floats(color, &colors.device());
         color.reshape([1, 3]).repeat_dim(0, count)
     });
-    // `-1` and a repeat instead of a broadcast, because N may be 0.
-    let mut opacities = gaussians.opacities().reshape([1, -1]).repeat_dim(0, count);
+    let opacities = gaussians.opacities();
     if settings.antialias {
-        opacities = opacities * projected.compensations();
+        // `-1` and a repeat instead of a broadcast, because N may be 0.
+        let opacities = opacities.reshape([1, -1]).repeat_dim(0, count);
+        let opacities = opacities * projected.compensations();
+        return rasterize(
+            projected,
+            colors,
+            opacities,
+            background,
+            &settings.rasterize,
+        );
     }
     rasterize(
         projected,

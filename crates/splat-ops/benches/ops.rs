@@ -4,10 +4,10 @@
 use burn::tensor::{DType, Device, Int, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
-use splat_ops::device::kernel_work;
+use splat_ops::device::{kernel_work, reads_half};
 use splat_ops::{
-    ImageSize, ProjectSettings, RasterizeSettings, ScreenStatistics, SsimArgs, exp, photometric,
-    project, rasterize, sh_colors, sigmoid,
+    ImageSize, ProjectSettings, Projected, RasterizeSettings, ScreenStatistics, SsimArgs, exp,
+    photometric, project, rasterize, sh_colors, sigmoid,
 };
 
 fn main() {
@@ -80,7 +80,7 @@ fn time_of_the_ops_beside_project_and_rasterize() {
         let rest = random.leaf([n, 15, 3], &device);
         let means = random.leaf([n, 3], &device);
         let centers = Tensor::<2>::from_data(random.data([1, 3], -1.0, 1.0), &device);
-        for centers in [centers.clone(), centers.require_grad()] {
+        for centers in [centers.clone(), centers.clone().require_grad()] {
             let posed = if centers.is_require_grad() {
                 ", centres"
             } else {
@@ -95,6 +95,24 @@ fn time_of_the_ops_beside_project_and_rasterize() {
                         sh_colors(sh0.clone(), rest, means.clone(), centers.clone(), 3).unwrap();
                     let grads = colors.sum().backward();
                     assert!(means.grad(&grads).is_some());
+                },
+            );
+        }
+
+        let plain = device.clone().inner();
+        let constant = |tensor: &Tensor<3>| tensor.clone().inner();
+        let mut stored = vec![("", constant(&rest))];
+        if reads_half(&plain) {
+            stored.push((", halves", constant(&rest).cast(DType::F16)));
+        }
+        for (precision, rest) in stored {
+            measure(
+                &format!("{name}: sh_colors, rendering{precision}"),
+                &device,
+                || {
+                    let (sh0, means) = (constant(&sh0), means.clone().inner());
+                    let rest = Some(rest.clone());
+                    sh_colors(sh0, rest, means, centers.clone().inner(), 3).unwrap();
                 },
             );
         }
@@ -123,26 +141,25 @@ fn time_of_the_ops_beside_project_and_rasterize() {
         };
         measure(&format!("{name}: photometric"), &device, || {
             let measured = photometric(rendered.clone(), levels.clone(), &args).unwrap();
-            let grads = (measured.l1 - measured.ssim).backward();
+            let grads = measured.losses().sum().backward();
             assert!(rendered.grad(&grads).is_some());
         });
 
-        let plain = device.clone().inner();
         let packed = Tensor::<3>::from_data(random.data([1, n, 9], -1.0, 1.0), &plain);
+        let size = ImageSize {
+            width: w as u32,
+            height: h as u32,
+        };
+        let projected = Projected::from_packed(packed.clone(), size).unwrap();
         let start = Tensor::<1>::zeros([n], &plain);
         let mut sums = Some(ScreenStatistics {
             gradients: start.clone(),
             views: start,
         });
-        let size = ImageSize {
-            width: w as u32,
-            height: h as u32,
-        };
         measure(&format!("{name}: screen statistics"), &device, || {
-            let [gradient, extents] = [0, 7].map(|first| packed.clone().narrow(2, first, 2));
             sums = sums
                 .take()
-                .map(|sums| sums.add(gradient, extents, size).unwrap());
+                .map(|sums| sums.add(packed.clone(), &projected).unwrap());
         });
     }
 }

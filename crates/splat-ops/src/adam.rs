@@ -36,8 +36,8 @@ pub enum AdamRows {
 
 /// Steps a parameter and its two moments, all of one shape:
 /// `m = beta_1 m + (1 - beta_1) g`, `v = beta_2 v + (1 - beta_2) g^2`,
-/// `p = p - rate m / (sqrt(v) + epsilon)`. Not differentiable. On the CPU one pass over memory, in place where nothing
-/// else holds the tensors.
+/// `p = p - rate m / (sqrt(v) + epsilon)`. Not differentiable. One pass over memory, in place where nothing else
+/// holds the tensors.
 ///
 /// A gradient whose square is not finite counts as zero: one NaN would stay in the moments for good.
 ///

@@ -147,7 +147,7 @@ pub trait SplatBackend: Backend {
         composed::ssim_backward::<Self>(images, moments, grad, args, wanted)
     }
 
-    /// Means `[2]` of [`photometric`](crate::photometric).
+    /// [`Photometric::losses`](crate::Photometric::losses), `[2]`.
     fn photometric(
         rendered: FloatTensor<Self>,
         target: Target<Self>,
@@ -176,7 +176,7 @@ pub trait SplatBackend: Backend {
         composed::photometric_backward::<Self>(rendered, target, kept, grad)
     }
 
-    /// [`ScreenStatistics::add`](crate::ScreenStatistics::add): gradient and extents `[C, N, 2]` and both sums `[N]` to the
+    /// [`ScreenStatistics::add`](crate::ScreenStatistics::add): gradient and splats `[C, N, 9]` and both sums `[N]` to the
     /// sums with the lengths of `half * gradient` and the views added.
     fn add_screen_statistics(
         tensors: [FloatTensor<Self>; 4],
@@ -299,7 +299,7 @@ pub(crate) trait SplatOps: Backend {
 
     fn screen_statistics(
         gradient: FloatTensor<Self>,
-        extents: FloatTensor<Self>,
+        packed: FloatTensor<Self>,
         gradients: FloatTensor<Self>,
         views: FloatTensor<Self>,
         half: [f64; 2],
@@ -405,12 +405,12 @@ macro_rules! forward_only {
 
             fn screen_statistics(
                 gradient: FloatTensor<Self>,
-                extents: FloatTensor<Self>,
+                packed: FloatTensor<Self>,
                 gradients: FloatTensor<Self>,
                 views: FloatTensor<Self>,
                 half: [f64; 2],
             ) -> StatisticsTensors<Self> {
-                let tensors = [gradient, extents, gradients, views];
+                let tensors = [gradient, packed, gradients, views];
                 let [gradients, views] = Self::add_screen_statistics(tensors, half);
                 StatisticsTensors { gradients, views }
             }

@@ -62,6 +62,18 @@ pub fn describe(device: &Device) -> Option<Vec<(&'static str, String)>> {
     }
 }
 
+/// Whether [`sh_colors`](crate::sh_colors) reads coefficients in half precision (F16) on a device as they are. Where it
+/// does not, it makes others of them, which costs more than it saves.
+pub fn reads_half(device: &Device) -> bool {
+    #[cfg(feature = "cube")]
+    return client(device).is_some_and(|client| splat_kernels::reads_half(&client));
+    #[cfg(not(feature = "cube"))]
+    {
+        let _ = device;
+        false
+    }
+}
+
 /// What the kernels did so far.
 pub fn kernel_work() -> KernelWork {
     #[cfg(feature = "cube")]

@@ -32,10 +32,25 @@ impl From<Tensor<4>> for Target {
 /// What [`photometric`] measures.
 #[derive(Debug, Clone)]
 pub struct Photometric {
+    losses: Tensor<1>,
+}
+
+impl Photometric {
+    /// `[2]`: the mean absolute difference and one less the mean structural similarity, the terms of 3DGS eq. 7, both zero
+    /// for equal images. Nothing is cut: a loss that weighs and adds them as they are has the least to do.
+    pub fn losses(&self) -> Tensor<1> {
+        self.losses.clone()
+    }
+
     /// Mean absolute difference, `[1]`.
-    pub l1: Tensor<1>,
+    pub fn l1(&self) -> Tensor<1> {
+        self.losses().narrow(0, 0, 1)
+    }
+
     /// Mean structural similarity, `[1]`.
-    pub ssim: Tensor<1>,
+    pub fn ssim(&self) -> Tensor<1> {
+        self.losses().narrow(0, 1, 1).neg() + 1.0
+    }
 }
 
 /// Mean absolute difference and mean structural similarity (Wang et al. 2004, eq. 13) of images `[B, H, W, E]` and a
@@ -81,10 +96,9 @@ pub fn photometric(
             backend::Target::Values(values.into_dispatch())
         }
     };
-    let means = <Dispatch as SplatOps>::photometric(rendered.into_dispatch(), target, args.clone());
-    let means = Tensor::<1>::from_dispatch(means);
+    let losses =
+        <Dispatch as SplatOps>::photometric(rendered.into_dispatch(), target, args.clone());
     Ok(Photometric {
-        l1: means.clone().narrow(0, 0, 1),
-        ssim: means.narrow(0, 1, 1),
+        losses: Tensor::from_dispatch(losses),
     })
 }

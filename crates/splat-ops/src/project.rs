@@ -75,24 +75,20 @@ impl Projected {
         self.size
     }
 
-    /// Ties a leaf `[C, N, 2]` to the screen means, so that after the backward pass the leaf's gradient is that of the
-    /// screen means (density control reads it; 3DGS section 5.2). The leaf's values are not read: the splats stay as
-    /// they are.
-    ///
-    /// # Errors
-    /// When the probe is not `[C, N, 2]`.
-    pub fn with_screen_probe(self, probe: Tensor<3>) -> Result<Self, OpError> {
-        let check = Checker::new("Projected", "packed", &self.packed)?;
-        let [c, n, _] = self.packed.dims();
-        check.tensor("probe", &probe, [Some(c), Some(n), Some(2)], "[C, N, 2]")?;
+    /// The same splats, and a leaf `[C, N, 9]` tied to them, whose gradient after the backward pass is theirs: its first
+    /// two columns are that of the screen means, which density control reads (3DGS section 5.2). The leaf lies in the
+    /// memory of the splats, and its gradient in that of theirs: nothing is copied.
+    pub fn with_screen_probe(self) -> (Self, Tensor<3>) {
+        let probe = self.packed.clone().detach().require_grad();
         let packed = <Dispatch as SplatOps>::screen_probe(
             self.packed.into_dispatch(),
-            probe.into_dispatch(),
+            probe.clone().into_dispatch(),
         );
-        Ok(Self {
+        let probed = Self {
             packed: Tensor::from_dispatch(packed),
             size: self.size,
-        })
+        };
+        (probed, probe)
     }
 
     fn columns(&self, start: usize, length: usize) -> Tensor<3> {

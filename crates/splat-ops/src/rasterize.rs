@@ -1,5 +1,7 @@
 //! Tile rasterisation: bin, sort, blend (3DGS section 6 and appendix C).
 
+use std::sync::OnceLock;
+
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 
@@ -12,9 +14,9 @@ use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
 #[derive(Debug, Clone)]
 pub struct Rendered {
     packed: Tensor<4>,
-    /// Views of it, cut once: the gradient of every cut is a whole picture of its own.
-    image: Tensor<4>,
-    alpha: Tensor<4>,
+    /// Cut out of it when first asked for, and once: every cut is a copy, and its gradient a whole picture.
+    image: OnceLock<Tensor<4>>,
+    alpha: OnceLock<Tensor<4>>,
 }
 
 impl Rendered {
@@ -25,12 +27,16 @@ impl Rendered {
 
     /// `[C, H, W, D]`: blended channels, in front of the background where one was given.
     pub fn image(&self) -> Tensor<4> {
-        self.image.clone()
+        let [.., width] = self.packed.dims();
+        let cut = || self.packed.clone().narrow(3, 0, width - 1);
+        self.image.get_or_init(cut).clone()
     }
 
     /// `[C, H, W, 1]`: accumulated opacity, one minus the final transmittance.
     pub fn alpha(&self) -> Tensor<4> {
-        self.alpha.clone()
+        let [.., width] = self.packed.dims();
+        let cut = || self.packed.clone().narrow(3, width - 1, 1);
+        self.alpha.get_or_init(cut).clone()
     }
 }
 
@@ -88,12 +94,20 @@ pub fn rasterize<const DC: usize, const DO: usize>(
     if let Some(error) = errors.error() {
         return Err(error.clone());
     }
-    let packed = Tensor::from_dispatch(packed);
     Ok(Rendered {
-        image: packed.clone().narrow(3, 0, channels),
-        alpha: packed.clone().narrow(3, channels, 1),
-        packed,
+        packed: Tensor::from_dispatch(packed),
+        image: OnceLock::new(),
+        alpha: OnceLock::new(),
     })
+}
+
+/// What is the same for all of `cameras`, once for each. For one camera there is nothing to repeat, and nothing to sum in
+/// the gradient.
+fn repeat<const R: usize>(one: Tensor<R>, cameras: usize) -> Tensor<R> {
+    match cameras {
+        1 => one,
+        _ => one.repeat_dim(0, cameras),
+    }
 }
 
 /// Colours `[C, N, D]` and opacities `[C, N]`, checked, of what [`rasterize`] takes.
@@ -113,7 +127,7 @@ pub(crate) fn per_camera<const DC: usize, const DO: usize>(
         [cc, cn, d] if *cc == c && *cn == n && *d > 0 => {
             colors.reshape([count(c), -1, count(channels)])
         }
-        [cn, d] if *cn == n && *d > 0 => colors.reshape([1, -1, count(channels)]).repeat_dim(0, c),
+        [cn, d] if *cn == n && *d > 0 => repeat(colors.reshape([1, -1, count(channels)]), c),
         other => {
             return Err(OpError::Shape {
                 op: "rasterize",
@@ -125,7 +139,7 @@ pub(crate) fn per_camera<const DC: usize, const DO: usize>(
     };
     let opacities: Tensor<2> = match opacities.dims().as_slice() {
         [oc, on] if *oc == c && *on == n => opacities.reshape([count(c), -1]),
-        [on] if *on == n => opacities.reshape([1, -1]).repeat_dim(0, c),
+        [on] if *on == n => repeat(opacities.reshape([1, -1]), c),
         other => {
             return Err(OpError::Shape {
                 op: "rasterize",

@@ -3,9 +3,9 @@
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 
-use crate::backend::SplatOps;
+use crate::backend::{PROJECTED_WIDTH, SplatOps};
 use crate::check::Checker;
-use crate::{ImageSize, OpError};
+use crate::{OpError, Projected};
 
 /// Sums over the views so far, per Gaussian.
 #[derive(Debug, Clone)]
@@ -17,30 +17,29 @@ pub struct ScreenStatistics {
 }
 
 impl ScreenStatistics {
-    /// Adds a step: gradients of the screen means `[C, N, 2]` in 1 / pixels, of a loss that is a mean over C cameras, and
-    /// extents `[C, N, 2]`, positive where a camera sees the Gaussian. A gradient that is not finite counts as zero.
-    /// One pass over memory, in place where nothing else holds the statistics. Not differentiable.
+    /// Adds a step: splats, and the gradient of their packed rows `[C, N, 9]`, of a loss that is a mean over C cameras, as
+    /// [`Projected::with_screen_probe`] hears it. Its first two columns count, in 1 / pixels, where the extent says that a
+    /// camera sees the Gaussian. A gradient that is not finite counts as zero. One pass over memory, in place where
+    /// nothing else holds the statistics. Not differentiable.
     ///
     /// # Errors
     /// When shapes, types or devices do not fit.
-    pub fn add(
-        self,
-        gradient: Tensor<3>,
-        extents: Tensor<3>,
-        size: ImageSize,
-    ) -> Result<Self, OpError> {
+    pub fn add(self, gradient: Tensor<3>, projected: &Projected) -> Result<Self, OpError> {
+        // Autodiff has no part in this.
+        let (gradient, packed) = (gradient.inner(), projected.packed().inner());
         let check = Checker::new("ScreenStatistics::add", "gradient", &gradient)?;
         let [c, n, _] = gradient.dims();
-        let pairs = [Some(c), Some(n), Some(2)];
-        check.tensor("gradient", &gradient, pairs, "[C, N, 2]")?;
-        check.tensor("extents", &extents, pairs, "[C, N, 2]")?;
+        let rows = [Some(c), Some(n), Some(PROJECTED_WIDTH)];
+        check.tensor("gradient", &gradient, rows, "[C, N, 9]")?;
+        check.tensor("projected", &packed, rows, "[C, N, 9]")?;
         check.tensor("gradients", &self.gradients, [Some(n)], "[N]")?;
         check.tensor("views", &self.views, [Some(n)], "[N]")?;
         // Pixels to half images, and the mean over cameras to a sum.
+        let size = projected.image_size();
         let half = [size.width, size.height].map(|side| f64::from(side) / 2.0 * c as f64);
         let sums = <Dispatch as SplatOps>::screen_statistics(
             gradient.into_dispatch(),
-            extents.into_dispatch(),
+            packed.into_dispatch(),
             self.gradients.into_dispatch(),
             self.views.into_dispatch(),
             half,

@@ -1,10 +1,11 @@
 //! Colours of Gaussians as cameras see them (3DGS section 4).
 
 use burn::backend::Dispatch;
-use burn::tensor::Tensor;
+use burn::tensor::{DType, Tensor};
 
 use crate::backend::{Optional, SplatOps};
 use crate::check::Checker;
+use crate::device::reads_half;
 use crate::{OpError, SH_DEGREE_MAX, sh_coefficient_count};
 
 /// Colours `[C, N, 3]` of N Gaussians in C cameras: `max(SH(mean - centre) + 0.5, 0)`, SH being
@@ -15,7 +16,9 @@ use crate::{OpError, SH_DEGREE_MAX, sh_coefficient_count};
 /// # Arguments
 /// - `sh0` `[N, 1, 3]`: coefficients of degree 0.
 /// - `sh_rest` `[N, R, 3]` with 1 + R >= (degree + 1)^2: those of the higher degrees. What is beyond `degree` is not read
-///   and gets zero gradient; at degree 0 none of it is read, and it is no part of the graph.
+///   and gets zero gradient; at degree 0 none of it is read, and it is no part of the graph. May be of half precision
+///   (F16) if autodiff does not track it: half of the bytes to store and to read, each coefficient to 2^-11 of itself,
+///   all sums as ever.
 /// - `means` `[N, 3]`: world space.
 /// - `centers` `[C, 3]`: where the cameras stand.
 /// - `degree`: 0 to 3.
@@ -36,9 +39,14 @@ pub fn sh_colors(
     check.tensor("sh0", &sh0, [None, Some(1), Some(3)], "[N, 1, 3]")?;
     check.tensor("means", &means, [Some(n), Some(3)], "[N, 3]")?;
     check.tensor("centers", &centers, [None, Some(3)], "[C, 3]")?;
-    if let Some(rest) = &sh_rest {
-        check.tensor("sh_rest", rest, [Some(n), None, Some(3)], "[N, R, 3]")?;
-    }
+    let sh_rest = match sh_rest {
+        Some(rest) => {
+            let rest = readable(&check, rest, sh0.dtype())?;
+            check.place("sh_rest", &rest, [Some(n), None, Some(3)], "[N, R, 3]")?;
+            Some(rest)
+        }
+        None => None,
+    };
     if degree > SH_DEGREE_MAX {
         return Err(check.argument(format!(
             "degree {degree} is not available; the highest is {SH_DEGREE_MAX}"
@@ -63,4 +71,23 @@ pub fn sh_colors(
         degree,
     );
     Ok(Tensor::from_dispatch(colors))
+}
+
+/// Coefficients as the device of the op reads them: those in half precision as they are where its kernels can, and
+/// otherwise in the type of all other tensors.
+fn readable(check: &Checker, rest: Tensor<3>, dtype: DType) -> Result<Tensor<3>, OpError> {
+    if rest.dtype() != DType::F16 {
+        check.tensor("sh_rest", &rest, [None; 3], "[N, R, 3]")?;
+        return Ok(rest);
+    }
+    if rest.is_tracked() {
+        return Err(check.argument(
+            "`sh_rest` is in half precision, and autodiff tracks it: gradients are too small for that; train in F32"
+                .into(),
+        ));
+    }
+    if reads_half(&rest.device()) {
+        return Ok(rest);
+    }
+    Ok(rest.cast(dtype))
 }

@@ -2,6 +2,7 @@
 //! can use plane operations do without them here; `planes.rs` beside this has the others.
 
 mod activation;
+mod adam;
 mod adapter;
 mod blur;
 mod device;
@@ -13,6 +14,7 @@ mod rasterize;
 mod reference;
 mod scan;
 mod sh;
+mod sh_colors;
 mod sort;
 
 /// Whether kernels use plane operations.

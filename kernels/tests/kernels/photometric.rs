@@ -25,7 +25,7 @@ fn shape([images, height, width]: [usize; 3], channels: usize, pixel: usize) -> 
     }
 }
 
-/// Means of absolute difference and similarity, from the definition.
+/// The mean absolute difference, and one less the mean similarity, from the definition.
 fn reference(rendered: &[f64], photo: &[f64], shape: &PhotometricShape) -> [f64; 2] {
     let (h, w) = (shape.height as isize, shape.width as isize);
     let margin = if h < 5 || w < 5 { 0 } else { 2 };
@@ -68,7 +68,7 @@ fn reference(rendered: &[f64], photo: &[f64], shape: &PhotometricShape) -> [f64;
             }
         }
     }
-    [l1 / photo.len() as f64, ssim / counted]
+    [l1 / photo.len() as f64, 1.0 - ssim / counted]
 }
 
 /// Means and gradient.
@@ -141,9 +141,9 @@ fn photos_of_any_kind_give_the_means_and_the_gradient_of_the_definition() {
             .collect();
         let wide: Vec<f64> = rendered.iter().map(|x| f64::from(*x)).collect();
         assert_close("means", &means, &reference(&wide, &photo, &shape), 2e-6);
-        let ssim = |x: &[f64]| reference(x, &photo, &shape)[1];
+        let d_ssim = |x: &[f64]| reference(x, &photo, &shape)[1];
         // The absolute value has no slope where both are equal: one over the number of values elsewhere.
-        let mut expected = differences(&wide, 1e-5, |x| -1.3 * ssim(x));
+        let mut expected = differences(&wide, 1e-5, |x| -1.3 * d_ssim(x));
         for (i, value) in expected.iter_mut().enumerate() {
             let (pixel, channel) = (i / shape.pixel, i % shape.pixel);
             if channel < channels {

@@ -6,7 +6,7 @@ use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
 use rand_pcg::Pcg64Mcg;
 use serde::{Deserialize, Serialize};
-use splat_ops::{ImageSize, OpError, ScreenStatistics};
+use splat_ops::{OpError, Projected, ScreenStatistics};
 
 use super::edit::{RowPlan, apply_plan, clamp_opacities};
 use crate::Gaussians;
@@ -127,15 +127,14 @@ impl AdaptiveDensity {
         step < self.run.milestone(self.settings.stop)
     }
 
-    /// Takes in a step: gradient of the screen means `[C, N, 2]`, extents `[C, N, 2]`.
+    /// Takes in a step: its splats, and the gradient `[C, N, 9]` of their packed rows.
     ///
     /// # Errors
     /// When they do not fit each other.
     pub fn observe(
         &mut self,
         screen_gradient: Tensor<3>,
-        extents: Tensor<3>,
-        size: ImageSize,
+        projected: &Projected,
     ) -> Result<(), OpError> {
         let [_, n, _] = screen_gradient.dims();
         let before = self
@@ -149,7 +148,7 @@ impl AdaptiveDensity {
                 views: zeros,
             }
         });
-        self.statistics = Some(before.add(screen_gradient, extents.inner(), size)?);
+        self.statistics = Some(before.add(screen_gradient, projected)?);
         Ok(())
     }
 
@@ -391,14 +390,15 @@ mod tests {
     fn a_gradient_that_is_not_finite_does_not_hide_other_views() {
         let device = burn::tensor::Device::flex();
         let mut density = AdaptiveDensity::new(AdaptiveSettings::default(), RUN);
-        let size = ImageSize {
+        let size = splat_ops::ImageSize {
             width: 2,
             height: 2,
         };
         for x in [3.0, f32::NAN, f32::INFINITY, 1.0] {
-            let gradient = Tensor::<3>::from_floats([[[x, 0.0], [2.0, 0.0]]], &device);
-            let seen = Tensor::ones([1, 2, 2], &device);
-            density.observe(gradient, seen, size).unwrap();
+            let [first, second] = [x, 2.0].map(|x| [x, 0.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0, 9.0]);
+            let gradient = Tensor::<3>::from_floats([[first, second]], &device);
+            let seen = Projected::from_packed(Tensor::ones([1, 2, 9], &device), size).unwrap();
+            density.observe(gradient, &seen).unwrap();
         }
         let (gradients, views) = density.statistics().unwrap();
         assert_eq!((gradients, views), (vec![4.0, 8.0], vec![4.0, 4.0]));

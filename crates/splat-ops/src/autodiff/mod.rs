@@ -106,12 +106,12 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
 
     fn screen_statistics(
         gradient: FloatTensor<Self>,
-        extents: FloatTensor<Self>,
+        packed: FloatTensor<Self>,
         gradients: FloatTensor<Self>,
         views: FloatTensor<Self>,
         half: [f64; 2],
     ) -> StatisticsTensors<Self> {
-        let tensors = [gradient, extents, gradients, views].map(|tensor| tensor.into_primitive());
+        let tensors = [gradient, packed, gradients, views].map(|tensor| tensor.into_primitive());
         let [gradients, views] = B::add_screen_statistics(tensors, half).map(Self::from_inner);
         StatisticsTensors { gradients, views }
     }

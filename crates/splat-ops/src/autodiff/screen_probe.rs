@@ -1,9 +1,9 @@
-//! `screen_probe`: splats pass unchanged, and so does their gradient; the probe gets its first two columns.
+//! `screen_probe`: splats pass unchanged, and so does their gradient, which the probe gets too.
 
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
-use burn::backend::{Autodiff, TensorMetadata, tensor::FloatTensor};
+use burn::backend::{Autodiff, tensor::FloatTensor};
 
 use super::register;
 use crate::backend::SplatBackend;
@@ -17,12 +17,7 @@ impl<B: SplatBackend> Backward<B, 2> for ScreenProbeBackward {
     fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
         let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
-        let means = parents[1].is_some().then(|| {
-            let shape = grad.shape();
-            let columns = [0..shape[0], 0..shape[1], 0..2].map(Into::into);
-            B::float_slice(grad.clone(), &columns)
-        });
-        register::<B, 2>(grads, parents, [Some(grad), means]);
+        register::<B, 2>(grads, parents, [Some(grad.clone()), Some(grad)]);
     }
 }
 

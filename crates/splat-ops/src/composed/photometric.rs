@@ -105,7 +105,7 @@ fn counted_part<B: SplatBackend>(map: &FloatTensor<B>, args: &SsimArgs) -> [Rang
     [0..b, rows, columns, 0..d]
 }
 
-/// Means of absolute difference and of the counted part of the similarity.
+/// The mean absolute difference, and one less the mean of the counted part of the similarity.
 fn means<B: SplatBackend>(
     [x, y]: [FloatTensor<B>; 2],
     map: FloatTensor<B>,
@@ -114,7 +114,8 @@ fn means<B: SplatBackend>(
     let slices = counted_part::<B>(&map, args).map(Slice::from);
     let l1 = B::float_mean(B::float_abs(B::float_sub(x, y)));
     let ssim = B::float_mean(B::float_slice(map, &slices));
-    B::float_cat(vec![l1, ssim], 0)
+    let d_ssim = B::float_add_scalar(B::float_neg(ssim), 1.0.into());
+    B::float_cat(vec![l1, d_ssim], 0)
 }
 
 /// [`photometric`](crate::photometric).
@@ -170,7 +171,10 @@ pub(crate) fn photometric_backward<B: SplatBackend>(
     let count = shape.num_elements() as f64;
     let l1 = B::float_div_scalar(scalar(0), count.into());
     let sign = B::float_sign(B::float_sub(x, y));
-    let gradient = B::float_add(B::float_mul(sign, l1), B::float_mul(slope, scalar(1)));
+    let gradient = B::float_add(
+        B::float_mul(sign, l1),
+        B::float_mul(slope, B::float_neg(scalar(1))),
+    );
     if whole == shape {
         return gradient;
     }

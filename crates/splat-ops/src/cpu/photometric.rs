@@ -22,7 +22,7 @@ use sweep::{Scratch, Sweep};
 /// Rows per unit of parallel work. Fixed, so that sums are the same on any number of threads.
 const BAND: usize = 64;
 
-/// Means `[2]` of absolute difference and similarity.
+/// The mean absolute difference, and one less the mean similarity: `[2]`.
 pub(super) fn measure<T: Real>(
     _: PhantomData<T>,
     rendered: FlexTensor,
@@ -73,11 +73,11 @@ fn means<T: Real>(pictures: &Pictures, args: &SsimArgs, slope: Option<&mut [T]>)
         })
         .collect();
     let counts = [b * h * w * d, sweep.count];
-    let means = [0, 1].map(|i| {
+    let [l1, ssim] = [0, 1].map(|i| {
         let sum: f64 = sums.iter().map(|sums| sums[i]).sum();
-        T::of(sum / counts[i] as f64)
+        sum / counts[i] as f64
     });
-    tensor(means.to_vec(), [2])
+    tensor(vec![T::of(l1), T::of(1.0 - ssim)], [2])
 }
 
 /// Rows of one image, and where the gradient of the similarity goes, if anywhere.
@@ -100,7 +100,7 @@ pub(super) fn backward<T: Real>(
     let [b, h, w, d] = pictures.shape;
     let [slope, grad] = [slope, grad].map(Buffer::new);
     let (slope, grad) = (slope.slice::<T>(), grad.slice::<T>());
-    let weights = [grad[0] / T::of((b * h * w * d) as f64), grad[1]];
+    let weights = [grad[0] / T::of((b * h * w * d) as f64), -grad[1]];
     let rows = pictures.rows::<T>();
     let mut out = overwritten::<T>(b * h * w * e);
     if !out.is_empty() {

@@ -11,15 +11,17 @@ use super::real::Real;
 
 /// Gaussians per unit of parallel work, at least.
 const CHUNK: usize = 4096;
+/// Column of packed splats that has the extent along x.
+const EXTENT: usize = 7;
 
-/// `[C, N, 2]`, read where it lies: usually two columns of packed splats.
-struct Pairs<'a, T> {
+/// `[C, N, 9]`, read where it lies.
+struct Rows<'a, T> {
     values: &'a [T],
     start: usize,
     strides: [usize; 3],
 }
 
-impl<'a, T: Real> Pairs<'a, T> {
+impl<'a, T: Real> Rows<'a, T> {
     fn new(tensor: &'a FlexTensor) -> Self {
         let layout = tensor.layout();
         let stride = |axis: usize| layout.strides()[axis] as usize;
@@ -38,19 +40,19 @@ impl<'a, T: Real> Pairs<'a, T> {
 
 pub(super) fn add<T: Real>(
     _: PhantomData<T>,
-    [gradient, extents, gradients, views]: [FlexTensor; 4],
+    [gradient, packed, gradients, views]: [FlexTensor; 4],
     half: [f64; 2],
 ) -> [FlexTensor; 2] {
     let cameras = gradient.shape()[0];
     // A flipped view would have strides below zero.
-    let [gradient, extents] = [gradient, extents].map(|tensor| {
+    let [gradient, packed] = [gradient, packed].map(|tensor| {
         if tensor.layout().strides().iter().any(|stride| *stride < 0) {
             tensor.to_contiguous()
         } else {
             tensor
         }
     });
-    let (gradient, extents) = (Pairs::<T>::new(&gradient), Pairs::<T>::new(&extents));
+    let (gradient, packed) = (Rows::<T>::new(&gradient), Rows::<T>::new(&packed));
     let [width, height] = half.map(T::of);
     let mut sums = [gradients, views].map(BufferMut::new);
     let [gradients, views] = sums.each_mut().map(|buffer| buffer.slice::<T>());
@@ -62,7 +64,7 @@ pub(super) fn add<T: Real>(
         .for_each(|(n, (total, views))| {
             let (mut sum, mut count) = (T::ZERO, T::ZERO);
             for c in 0..cameras {
-                if extents.at(c, n, 0) > T::ZERO {
+                if packed.at(c, n, EXTENT) > T::ZERO {
                     let (x, y) = (gradient.at(c, n, 0) * width, gradient.at(c, n, 1) * height);
                     let length = (x * x + y * y).sqrt();
                     // What is not finite must not hide the other views of the same Gaussian.

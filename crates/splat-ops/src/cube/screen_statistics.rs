@@ -5,14 +5,14 @@ use splat_kernels::screen_statistics::screen_statistics;
 
 use super::{buffer, prepare, taken};
 
-/// Gradient and extents `[C, N, 2]` and both sums `[N]` to the sums with this step added.
+/// Gradient and splats `[C, N, 9]` and both sums `[N]` to the sums with this step added.
 pub(super) fn add(tensors: [CubeTensor; 4], half: [f64; 2]) -> [CubeTensor; 2] {
-    let [gradient, extents, lengths, views] = tensors.map(prepare);
+    let [gradient, packed, lengths, views] = tensors.map(prepare);
     let (lengths, lengths_tensor) = taken(lengths);
     let (views, views_tensor) = taken(views);
     let [lengths, views] = screen_statistics(
         &gradient.client,
-        [&buffer(&gradient), &buffer(&extents)],
+        [&buffer(&gradient), &buffer(&packed)],
         [lengths, views],
         half.map(|half| half as f32),
     );

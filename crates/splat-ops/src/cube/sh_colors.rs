@@ -1,9 +1,11 @@
 //! Colours in the directions of the cameras, on CubeCL devices.
 
 use burn::backend::TensorMetadata;
-use burn::tensor::Shape;
+use burn::tensor::{DType, Shape};
 use burn_cubecl::CubeBackend;
+use burn_cubecl::kernel::into_contiguous;
 use burn_cubecl::tensor::CubeTensor;
+use splat_kernels::HalfBuffer;
 use splat_kernels::sh_colors as kernels;
 
 use super::{buffer, prepare, tensor};
@@ -21,7 +23,8 @@ impl Prepared {
     fn new(inputs: ShInputs<CubeBackend>) -> Self {
         Self {
             sh0: prepare(inputs.sh0),
-            sh_rest: inputs.sh_rest.map(prepare),
+            // The kernels read both of the types that the op takes.
+            sh_rest: inputs.sh_rest.map(into_contiguous),
             means: prepare(inputs.means),
             centers: prepare(inputs.centers),
         }
@@ -30,7 +33,16 @@ impl Prepared {
     fn buffers(&self) -> kernels::ShInputs {
         kernels::ShInputs {
             sh0: buffer(&self.sh0),
-            sh_rest: self.sh_rest.as_ref().map(buffer),
+            sh_rest: self.sh_rest.as_ref().map(|rest| match rest.dtype {
+                DType::F16 => {
+                    let len = rest.shape().num_elements();
+                    HalfBuffer::new(rest.handle.clone(), len).map_or_else(
+                        |_| kernels::ShRest::Exact(buffer(rest)),
+                        kernels::ShRest::Half,
+                    )
+                }
+                _ => kernels::ShRest::Exact(buffer(rest)),
+            }),
             stored: self.sh_rest.as_ref().map_or(0, |rest| rest.shape()[1]),
             means: buffer(&self.means),
             centers: buffer(&self.centers),

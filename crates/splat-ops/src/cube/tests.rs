@@ -228,8 +228,8 @@ fn structural_similarity_and_its_gradients_are_those_of_the_native_path() {
 }
 
 /// Three steps of Adam; a gradient in the second is not a number, one in the third too large to be squared. Some rows
-/// have no gradient.
-fn run_adam(device: &Device, rows: AdamRows) -> Vec<f32> {
+/// have no gradient, one nothing but NaN, one nothing but infinity. What went into the first step is `held` or given away.
+fn run_adam(device: &Device, rows: AdamRows, held: bool) -> Vec<f32> {
     let mut rng = Pcg32::seed_from_u64(12);
     let mut values = |low: f32, high: f32| {
         let values: Vec<f32> = (0..1001).map(|_| rng.random_range(low..high)).collect();
@@ -238,6 +238,8 @@ fn run_adam(device: &Device, rows: AdamRows) -> Vec<f32> {
     let mut gradients = [values(-1.0, 1.0), values(-1e-6, 1e-6), values(-1e3, 1e3)];
     for gradient in &mut gradients {
         gradient[13 * 20..13 * 30].fill(0.0);
+        gradient[13 * 22 + 4] = f32::NAN;
+        gradient[13 * 27 + 12] = f32::INFINITY;
     }
     gradients[1][5] = f32::NAN;
     gradients[2][7] = 1e30;
@@ -252,13 +254,21 @@ fn run_adam(device: &Device, rows: AdamRows) -> Vec<f32> {
         epsilon: 1e-15,
         rows,
     };
+    let start = held.then(|| (param.clone(), moments.clone()));
+    let values_of = |tensor: &Tensor<2>| tensor.to_data().try_to_vec::<f32>().unwrap();
+    let first = values_of(&param);
     for gradient in gradients {
         (param, moments) = adam_step(param, tensor(gradient), moments, &step).unwrap();
     }
+    if let Some((param, [moment_1, moment_2])) = start {
+        assert_eq!(values_of(&param), first);
+        assert_eq!(values_of(&moment_1), [0.0; 1001]);
+        assert_eq!(values_of(&moment_2), [0.0; 1001]);
+    }
     let [moment_1, moment_2] = moments;
     [param, moment_1, moment_2]
-        .into_iter()
-        .flat_map(|tensor| tensor.into_data().try_to_vec::<f32>().unwrap())
+        .iter()
+        .flat_map(values_of)
         .collect()
 }
 
@@ -268,8 +278,10 @@ fn a_step_of_adam_is_that_of_the_native_path() {
         return;
     }
     for rows in [AdamRows::All, AdamRows::Seen] {
-        let native = run_adam(&Device::flex(), rows);
-        let kernel = run_adam(&Device::wgpu(DeviceKind::DefaultDevice), rows);
+        let native = run_adam(&Device::flex(), rows, false);
+        let wgpu = Device::wgpu(DeviceKind::DefaultDevice);
+        let kernel = run_adam(&wgpu, rows, false);
+        assert_eq!(kernel, run_adam(&wgpu, rows, true), "{rows:?}");
         for (i, (kernel, native)) in kernel.iter().zip(&native).enumerate() {
             let error = (kernel - native).abs() / native.abs().max(1e-30);
             assert!(error <= 1e-6, "{rows:?}, value {i}: {kernel} and {native}");

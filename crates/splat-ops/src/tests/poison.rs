@@ -105,7 +105,7 @@ impl Scene {
         let similarity = ssim_map(blurred.clone(), rendered.packed(), &args).unwrap();
         let target = blurred.clone().detach().narrow(3, 0, d);
         let measured = photometric(rendered.packed(), target, &args).unwrap();
-        let averages = Tensor::cat(vec![measured.l1, measured.ssim], 0);
+        let averages = measured.losses();
         let mut loss = blurred.clone().square().sum() + similarity.clone().square().sum();
         loss = loss + averages.clone().square().sum();
         if n > 0 {

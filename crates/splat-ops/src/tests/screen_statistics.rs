@@ -3,9 +3,9 @@
 use burn::tensor::{Tensor, TensorData};
 
 use super::devices;
-use crate::{ImageSize, ScreenStatistics};
+use crate::{ImageSize, Projected, ScreenStatistics};
 
-/// Two cameras, five Gaussians; columns of packed rows, as the training loop has them.
+/// Two cameras, five Gaussians.
 #[test]
 fn lengths_in_half_images_are_summed_where_seen_and_finite() {
     let size = ImageSize {
@@ -21,14 +21,14 @@ fn lengths_in_half_images_are_summed_where_seen_and_finite() {
             values[at] = value;
         }
         let tensor = Tensor::<3>::from_data(TensorData::new(values.clone(), [2, 5, 9]), &device);
-        let (gradient, extents) = (tensor.clone().narrow(2, 0, 2), tensor.narrow(2, 7, 2));
+        let projected = Projected::from_packed(tensor.clone(), size).unwrap();
         let start = Tensor::<1>::from_floats([1.0, 2.0, 3.0, 4.0, 5.0], &device);
         let held = start.clone();
         let sums = ScreenStatistics {
             gradients: start.clone(),
             views: start,
         };
-        let sums = sums.add(gradient, extents, size).unwrap();
+        let sums = sums.add(tensor, &projected).unwrap();
         let host = |x: Tensor<1>| x.into_data().try_into_vec::<f32>().unwrap();
         assert_eq!(host(held), [1.0, 2.0, 3.0, 4.0, 5.0], "{name}");
         let (gradients, views) = (host(sums.gradients), host(sums.views));

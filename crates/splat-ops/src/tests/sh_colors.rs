@@ -170,7 +170,59 @@ fn what_does_not_fit_is_an_error() {
         refuse(rest(14), leaves.centers.clone(), 3),
         refuse(rest(15), leaves.centers.clone(), 4),
         refuse(rest(15), Tensor::zeros([1, 4], &device), 1),
+        refuse(
+            rest(15).map(|rest| rest.cast(DType::F16)),
+            leaves.centers.clone(),
+            3,
+        ),
+        refuse(
+            rest(15).map(|rest| rest.cast(DType::F64)),
+            leaves.centers.clone(),
+            3,
+        ),
     ] {
         assert!(error.to_string().contains("sh_colors"), "{error}");
+    }
+}
+
+/// Colours and gradients where the higher degrees are stored in half precision, against double precision of the
+/// coefficients before they were rounded; and those of exact ones. Bright ones: at the clamp the gradient has a step.
+#[test]
+fn half_precision_costs_so_much() {
+    let (c, n) = (2, 2500);
+    let mut leaves = Leaves::new(c, n, &Device::flex().autodiff(), DType::F64);
+    leaves.sh0 = (leaves.sh0.set_require_grad(false).clamp_min(-1.0) + 6.0).require_grad();
+    leaves.sh_rest = (leaves.sh_rest.set_require_grad(false) * 0.25).require_grad();
+    let expected = leaves.results(leaves.fused(3));
+    for (name, device) in devices() {
+        let device = device.autodiff();
+        for (stored, bounds) in [(DType::F32, [1e-6, 1e-5]), (DType::F16, [1e-4, 4e-4])] {
+            let constant = |tensor: &Tensor<3>, dtype: DType| {
+                let data = tensor.clone().into_data();
+                Tensor::<3>::from_data(data, (&device, dtype))
+            };
+            let leaf = |tensor: &Tensor<2>| {
+                let data = tensor.clone().into_data();
+                Tensor::<2>::from_data(data, (&device, DType::F32)).require_grad()
+            };
+            let ours = Leaves {
+                sh0: constant(&leaves.sh0, DType::F32).require_grad(),
+                sh_rest: constant(&leaves.sh_rest, stored),
+                means: leaf(&leaves.means),
+                centers: leaf(&leaves.centers),
+            };
+            let found = ours.results(ours.fused(3));
+            for (part, found) in &found {
+                let (_, expected) = expected.iter().find(|(name, _)| name == part).unwrap();
+                let error = relative(found, expected);
+                println!("{name}, rest as {stored:?}: {part} {error:.1e}");
+                let bound = bounds[usize::from(*part != "colors")];
+                assert!(error <= bound, "{name}, {stored:?}: {part} {error:e}");
+                // That it was read as halves at all.
+                let read = stored == DType::F16 && *part == "colors";
+                assert!(!read || error > 5e-6, "{name}: {error:e}");
+            }
+            assert_eq!(found.len(), 4);
+        }
     }
 }

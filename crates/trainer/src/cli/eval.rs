@@ -20,6 +20,9 @@ pub struct EvalArgs {
     pub capture: PathBuf,
     /// Scene: a PLY file in the 3DGS layout
     pub scene: PathBuf,
+    /// How the higher degrees of spherical harmonics are stored and read
+    #[arg(long, value_enum, default_value_t)]
+    pub sh_precision: scene::PrecisionChoice,
     /// Views to measure
     #[arg(long, value_enum, default_value_t)]
     pub split: SplitChoice,
@@ -64,7 +67,7 @@ pub(super) fn run(args: &EvalArgs, global: &GlobalArgs) -> Result<(), Failure> {
         )));
     }
     let device = device::open(global)?.device;
-    let (gaussians, settings) = scene::open(&args.scene, &device, global)?;
+    let (gaussians, settings) = scene::open(&args.scene, &device, args.sh_precision, global)?;
     let scores = evaluate(&gaussians, &views, &settings, &device, |_, _| {})?;
     print(&table(&scores));
     if let Some(path) = &args.json {

@@ -28,6 +28,9 @@ viewmat maps world to camera (+x right, +y down, +z forward); the first pixel's 
 pub struct RenderArgs {
     /// Scene: a PLY file in the 3DGS layout
     pub scene: PathBuf,
+    /// How the higher degrees of spherical harmonics are stored and read
+    #[arg(long, value_enum, default_value_t)]
+    pub sh_precision: scene::PrecisionChoice,
     #[command(flatten)]
     cameras: CameraArgs,
     /// Folder to write the pictures to
@@ -63,7 +66,7 @@ enum Channel {
 /// Runs the command.
 pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let device = device::open(global)?.device;
-    let (gaussians, settings) = scene::open(&args.scene, &device, global)?;
+    let (gaussians, settings) = scene::open(&args.scene, &device, args.sh_precision, global)?;
     let cameras = match &args.cameras {
         CameraArgs {
             capture: Some(path),

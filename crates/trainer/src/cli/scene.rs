@@ -3,18 +3,30 @@
 use std::path::Path;
 
 use burn::tensor::Device;
+use clap::ValueEnum;
 use splat_model::files::ply;
 use splat_model::ops::SH_DEGREE_MAX;
-use splat_model::{Gaussians, RenderSettings};
+use splat_model::{Gaussians, RenderSettings, ShPrecision};
 
 use super::{Failure, GlobalArgs};
 use crate::train::TrainConfig;
+
+/// What `--sh-precision` takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub enum PrecisionChoice {
+    /// Single precision
+    #[default]
+    Exact,
+    /// The higher degrees in half precision, on devices that read it: less memory, colours to about 2e-4
+    Half,
+}
 
 /// Reads a scene. Scene files do not say whether they were trained with anti-aliasing or in front of a background;
 /// where the run's `config.toml` lies beside the file, it does.
 pub(super) fn open(
     path: &Path,
     device: &Device,
+    precision: PrecisionChoice,
     global: &GlobalArgs,
 ) -> Result<(Gaussians, RenderSettings), Failure> {
     let data = ply::read(path)?;
@@ -30,7 +42,14 @@ pub(super) fn open(
             global.say("rendering as the config.toml beside the scene says");
         }
     }
-    Ok((Gaussians::from_data(&data, device), settings))
+    let mut gaussians = Gaussians::from_data(&data, device);
+    if precision == PrecisionChoice::Half {
+        gaussians = gaussians.with_sh_precision(ShPrecision::Half);
+        if gaussians.sh_precision() == ShPrecision::Exact {
+            global.say("rendering exactly: there are no higher degrees that fit half precision, or the device reads none");
+        }
+    }
+    Ok((gaussians, settings))
 }
 
 /// Reads a run's settings.

@@ -59,14 +59,14 @@ pub struct LossTerms {
     groups: Vec<Group>,
 }
 
-/// Terms that are measured together.
+/// Terms that are measured together, as one tensor.
 struct Group {
     /// Names and weights.
     terms: Vec<(String, f64)>,
     measure: Box<Measure>,
 }
 
-type Measure = dyn Fn(&TargetView, &Rendered) -> Result<Vec<Tensor<1>>, OpError> + Send;
+type Measure = dyn Fn(&TargetView, &Rendered) -> Result<Tensor<1>, OpError> + Send;
 
 impl LossTerms {
     /// No terms yet.
@@ -81,20 +81,20 @@ impl LossTerms {
         weight: f64,
         term: impl Fn(&TargetView, &Rendered) -> Result<Tensor<1>, OpError> + Send + 'static,
     ) -> Self {
-        self.terms([(name, weight)], move |view, rendered| {
-            Ok([term(view, rendered)?])
-        })
+        self.terms([(name, weight)], term)
     }
 
-    /// Adds terms, names and weights, that one closure measures together.
-    pub fn terms<const N: usize>(
+    /// Adds terms, names and weights, that one closure measures together: as one tensor of as many values, because to
+    /// cut it and put it together again is work for the device, and more of it for the gradient.
+    pub fn terms(
         mut self,
-        terms: [(impl Into<String>, f64); N],
-        measure: impl Fn(&TargetView, &Rendered) -> Result<[Tensor<1>; N], OpError> + Send + 'static,
+        terms: impl IntoIterator<Item = (impl Into<String>, f64)>,
+        measure: impl Fn(&TargetView, &Rendered) -> Result<Tensor<1>, OpError> + Send + 'static,
     ) -> Self {
+        let terms = terms.into_iter();
         self.groups.push(Group {
-            terms: terms.map(|(name, weight)| (name.into(), weight)).into(),
-            measure: Box::new(move |view, rendered| Ok(measure(view, rendered)?.into())),
+            terms: terms.map(|(name, weight)| (name.into(), weight)).collect(),
+            measure: Box::new(measure),
         });
         self
     }
@@ -104,8 +104,7 @@ impl LossTerms {
         let args = SsimSettings::default().args();
         let terms = [("l1", 1.0 - ssim_weight), ("d_ssim", ssim_weight)];
         Self::new().terms(terms, move |view, rendered| {
-            let measured = photometric(rendered.packed(), view.levels(), &args)?;
-            Ok([measured.l1, measured.ssim.neg() + 1.0])
+            Ok(photometric(rendered.packed(), view.levels(), &args)?.losses())
         })
     }
 
@@ -115,7 +114,7 @@ impl LossTerms {
         terms.map(|(name, _)| name.as_str())
     }
 
-    /// The weighted sum, and the terms without their weights, detached; `None` without terms.
+    /// The weighted sum, and the terms without their weights, detached, in groups; `None` without terms.
     pub(super) fn evaluate(
         &self,
         view: &TargetView,
@@ -124,14 +123,30 @@ impl LossTerms {
         let mut total: Option<Tensor<1>> = None;
         let mut values = Vec::new();
         for Group { terms, measure } in &self.groups {
-            for (value, (_, weight)) in measure(view, rendered)?.into_iter().zip(terms) {
-                values.push(value.clone().inner());
-                let weighted = value * *weight;
-                total = Some(match total {
-                    Some(total) => total + weighted,
-                    None => weighted,
+            let value = measure(view, rendered)?;
+            if value.dims() != [terms.len()] {
+                let names: Vec<_> = terms.iter().map(|(name, _)| name.as_str()).collect();
+                return Err(OpError::Argument {
+                    op: "loss",
+                    what: format!(
+                        "the terms {names:?} are measured as {:?} values; return one for each name",
+                        value.dims()
+                    ),
                 });
             }
+            values.push(value.clone().inner());
+            let weighted = match &terms[..] {
+                [(_, weight)] => value * *weight,
+                _ => {
+                    let weights: Vec<f64> = terms.iter().map(|(_, weight)| *weight).collect();
+                    let at = (&value.device(), value.dtype());
+                    (value * Tensor::from_data(weights.as_slice(), at)).sum()
+                }
+            };
+            total = Some(match total {
+                Some(total) => total + weighted,
+                None => weighted,
+            });
         }
         Ok(total.map(|total| (total, values)))
     }

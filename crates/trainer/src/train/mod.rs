@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use burn::module::Module;
 use burn::optim::{GradientsParams, ModuleOptimizer};
-use burn::tensor::{Device, Tensor};
+use burn::tensor::{Device, Tensor, Transaction};
 use splat_model::density::{AdaptiveDensity, RunShape};
 use splat_model::ops::{OpError, SH_DEGREE_MAX};
 use splat_model::{
@@ -467,13 +467,10 @@ impl Trainer {
 
         let render = trace_span!("render").entered();
         let mut projected = project_gaussians(&self.gaussians, &cameras, &settings)?;
-        let extents = projected.extents();
-        let probe = self.state.density.observes(step).then(|| {
-            let shape = [1, self.gaussians.len(), 2];
-            Tensor::<3>::zeros(shape, &self.device).require_grad()
-        });
-        if let Some(probe) = &probe {
-            projected = projected.with_screen_probe(probe.clone())?;
+        let mut probe = None;
+        if self.state.density.observes(step) {
+            let (probed, leaf) = projected.with_screen_probe();
+            (projected, probe) = (probed, Some(leaf));
         }
         let rendered = render_projected(&self.gaussians, &projected, &cameras, &settings)?;
         drop(render);
@@ -488,6 +485,12 @@ impl Trainer {
         }
         let mut grads = trace_span!("backward").in_scope(|| loss.backward());
         let screen_gradient = probe.and_then(|probe| probe.grad_remove(&mut grads));
+        if let Some(gradient) = screen_gradient {
+            let _density = trace_span!("density").entered();
+            self.state.density.observe(gradient, &projected)?;
+        }
+        // The optimiser needs nothing of the picture.
+        drop((projected, rendered, target));
         let optimizer = trace_span!("optimizer").entered();
         let grads = GradientsParams::from_grads(grads, &self.gaussians);
         let rates = self
@@ -508,10 +511,6 @@ impl Trainer {
         });
         self.state.step += 1;
         let _density = trace_span!("density").entered();
-        if let Some(gradient) = screen_gradient {
-            let density = &mut self.state.density;
-            density.observe(gradient, extents, cameras.size)?;
-        }
         // What would be added after the last step would never be trained.
         if self.state.step < self.config.steps {
             self.control_density();
@@ -545,9 +544,16 @@ impl Trainer {
         if unread.is_empty() {
             return Ok(());
         }
-        let tensors = unread.iter().flat_map(|loss| loss.values.clone()).collect();
-        let values = Tensor::cat(tensors, 0).into_data().convert::<f32>();
-        let values = values.try_into_vec::<f32>().unwrap_or_default();
+        let values = unread.iter().flat_map(|loss| loss.values.clone());
+        let read = values.fold(Transaction::default(), Transaction::register);
+        let read = read.try_execute().map_err(|error| OpError::Device {
+            op: "training step",
+            what: error.to_string(),
+        })?;
+        let values = read.into_iter().map(|data| data.convert::<f32>());
+        let values: Vec<f32> = values
+            .flat_map(|data| data.try_into_vec::<f32>().unwrap_or_default())
+            .collect();
         for (loss, values) in unread
             .iter()
             .zip(values.chunks(1 + self.state.history.terms.len()))
@@ -765,6 +771,12 @@ mod tests {
         let constant = |view: &TargetView, _: &splat_model::ops::Rendered| Ok(view.image().mean());
         let error = builder().loss(constant).build().unwrap().run().unwrap_err();
         assert!(matches!(error, TrainError::Loss(_)), "{error}");
+
+        let two = |_: &TargetView, rendered: &splat_model::ops::Rendered| {
+            Ok(rendered.alpha().mean().repeat_dim(0, 2))
+        };
+        let error = builder().loss(two).build().unwrap().run().unwrap_err();
+        assert!(error.to_string().contains("one for each name"), "{error}");
 
         let not_a_number = |_: &TargetView, rendered: &splat_model::ops::Rendered| {
             Ok(rendered.image().mean() * f64::NAN)

@@ -1,0 +1,99 @@
+//! Colours of coefficients in half precision: those of the same coefficients in single precision, bit for bit.
+
+use cubecl::client::Client;
+use splat_kernels::sh_colors::{ShInputs, ShRest, sh_colors, sh_colors_backward};
+use splat_kernels::{Buffer, HalfBuffer, reads_half};
+
+use crate::device::{client, rng, uniform, upload};
+
+/// The float that a half stands for.
+fn single(half: u16) -> f32 {
+    let (exponent, fraction) = (i32::from(half >> 10 & 31), f32::from(half & 1023));
+    let magnitude = match exponent {
+        0 => fraction * 2f32.powi(-24),
+        31 if fraction == 0.0 => f32::INFINITY,
+        31 => f32::NAN,
+        _ => (1024.0 + fraction) * 2f32.powi(exponent - 25),
+    };
+    if half >> 15 == 1 {
+        -magnitude
+    } else {
+        magnitude
+    }
+}
+
+/// Colours, and the gradients of sh0, means and centres, as bits.
+fn bits(client: &Client, inputs: &ShInputs, grad: &Buffer, degree: usize) -> Vec<Vec<u32>> {
+    let read = |buffer: &Buffer| -> Vec<u32> {
+        let values = buffer.read_f32(client).unwrap();
+        values.iter().map(|value| value.to_bits()).collect()
+    };
+    let wanted = [true, false, true, true];
+    let grads = sh_colors_backward(client, inputs, grad, degree, wanted);
+    let mut found = vec![read(&sh_colors(client, inputs, degree))];
+    found.extend(grads.iter().flatten().map(read));
+    assert_eq!(found.len(), 4);
+    found
+}
+
+#[test]
+fn halves_are_read_as_the_numbers_they_stand_for() {
+    let Some(client) = client() else { return };
+    if !reads_half(&client) {
+        eprintln!("\n*** SKIPPED: this device reads no half precision ***\n");
+        return;
+    }
+    let mut rng = rng(37);
+    // An odd number of halves: the last is half of a word.
+    let (n, cameras) = (701, 2);
+    let mut halves: Vec<u16> = uniform(&mut rng, n * 45, 0.0, 65_536.0)
+        .iter()
+        .map(|half| *half as u16)
+        .map(|half| {
+            if half >> 10 & 31 > 16 {
+                half & 0xbfff
+            } else {
+                half
+            }
+        })
+        .collect();
+    // Zeros, the smallest, the largest below the normal ones, the smallest of these, the largest of all, infinity.
+    let odd = [0, 0x8000, 1, 0x8001, 0x03ff, 0x0400, 0x7bff, 0x7c00];
+    halves[..odd.len()].copy_from_slice(&odd);
+    let values: Vec<f32> = halves.iter().map(|half| single(*half)).collect();
+    assert_eq!(
+        values[2..7],
+        [
+            5.960_464_5e-8,
+            -5.960_464_5e-8,
+            6.097_555e-5,
+            6.103_515_6e-5,
+            65_504.0
+        ]
+    );
+
+    let bytes: Vec<u8> = halves.iter().flat_map(|half| half.to_le_bytes()).collect();
+    let handle = client.create_from_slice(&bytes);
+    assert!(HalfBuffer::new(handle.clone(), halves.len() + 1).is_err());
+    let exact = ShInputs {
+        sh0: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
+        sh_rest: Some(ShRest::Exact(upload(&client, &values))),
+        stored: 15,
+        means: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
+        centers: upload(&client, &uniform(&mut rng, cameras * 3, -1.0, 1.0)),
+    };
+    let half = ShInputs {
+        sh_rest: Some(ShRest::Half(HalfBuffer::new(handle, halves.len()).unwrap())),
+        ..exact.clone()
+    };
+    let grad = upload(&client, &uniform(&mut rng, cameras * n * 3, -1.0, 1.0));
+    for degree in 1..=3 {
+        let [found, expected] = [&half, &exact].map(|inputs| bits(&client, inputs, &grad, degree));
+        assert!(found == expected, "degree {degree}");
+        let colors = found[0].iter().filter(|color| **color != 0);
+        assert!(
+            colors.count() > n,
+            "degree {degree}: too few colours to compare"
+        );
+    }
+}
