@@ -25,6 +25,7 @@ fn settings(settings: &crate::RasterizeSettings) -> RasterizeSettings {
         } else {
             Sums::Atomic
         },
+        per_splat: false,
     }
 }
 
