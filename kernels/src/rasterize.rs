@@ -21,7 +21,6 @@ mod background;
 mod backward;
 mod forward;
 mod pair;
-mod per_splat;
 mod sums;
 mod tile;
 
@@ -31,9 +30,6 @@ use self::background::background_gradient;
 use self::backward::{SHAPE_GRADIENTS, SlotLayout, rasterize_backward};
 use self::forward::rasterize_forward;
 use self::pair::thresholds;
-use self::per_splat::{
-    BUCKET, MOST_STREAMED, TILE_PIXELS, buckets, rasterize_backward_per_splat, sum_behind,
-};
 pub use self::sums::Sums;
 use self::sums::sum_slots;
 use self::tile::Plan;
@@ -66,8 +62,6 @@ pub struct RasterizeSettings {
     pub transmittance_min: f32,
     /// How gradients of one splat from many tiles are summed.
     pub sums: Sums,
-    /// Whether the gradient goes by splats instead of by pixels, where it is summed in order.
-    pub per_splat: bool,
 }
 
 /// What a forward pass leaves for its backward pass.
@@ -79,8 +73,6 @@ pub struct RasterizeState {
     pub transmittance: Buffer,
     /// How many splats of its tile's list every pixel has walked, the last one that contributed included [C, H, W].
     pub walked: Buffer,
-    /// Of the buckets of all tiles: light that is left and colour, for a gradient by splats.
-    pub checkpoints: Option<Buffer>,
 }
 
 /// Splats, and what colours them: `packed` [C, N, 9], `colors` [C, N, D], `opacities` [C, N], `background` [C, D].
@@ -153,7 +145,7 @@ pub fn rasterize(
         intersect_ahead(client, &inputs.packed, &opacities, frames, |lists| {
             blend(client, inputs, lists, frames, settings, false)
         })?;
-    let [output, transmittance, walked, checkpoints] = blended;
+    let [output, transmittance, walked] = blended;
     if settings.sums != Sums::Ordered {
         lists.slots = None;
     }
@@ -161,7 +153,6 @@ pub fn rasterize(
         lists,
         transmittance,
         walked,
-        checkpoints: (!checkpoints.is_empty()).then_some(checkpoints),
     };
     Ok((output, state))
 }
@@ -175,15 +166,8 @@ fn blend(
     frames: &Frames,
     settings: &RasterizeSettings,
     counting: bool,
-) -> [Buffer; 4] {
+) -> [Buffer; 3] {
     let plan = Plan::new(client);
-    let saving = settings.per_splat && inputs.channels <= MOST_STREAMED && !counting;
-    let checkpoints = if saving {
-        buckets(lists.instances, frames.tiles()) * TILE_PIXELS * (inputs.channels + 1)
-    } else {
-        0
-    };
-    let checkpoints = Buffer::empty(client, checkpoints);
     let pixels = frames.cameras * frames.width as usize * frames.height as usize;
     let output = Buffer::empty(client, pixels * (inputs.channels + 1));
     let transmittance = Buffer::empty(client, pixels);
@@ -204,7 +188,6 @@ fn blend(
             output.arg(),
             transmittance.arg(),
             walked.arg(),
-            checkpoints.arg(),
             frames.uniforms(),
             thresholds(frames, settings),
             inputs.channels as u32,
@@ -214,10 +197,9 @@ fn blend(
             inputs.background.is_some(),
             first_channel == 0,
             counting,
-            saving,
         );
     }
-    [output, transmittance, walked, checkpoints]
+    [output, transmittance, walked]
 }
 
 /// What forward and gradient must move for one camera, with lists that are there; the gradient summed in order.
@@ -320,7 +302,7 @@ pub fn count_evaluations(
     frames: &Frames,
     settings: &RasterizeSettings,
 ) -> Result<Evaluations, String> {
-    let [output, tested, blended, _] = blend(client, inputs, &state.lists, frames, settings, true);
+    let [output, tested, blended] = blend(client, inputs, &state.lists, frames, settings, true);
     let output = output.read_f32(client)?;
     let seen = output.chunks_exact(inputs.channels + 1);
     let seen = seen.map(|pixel| pixel[inputs.channels] as u64).sum();
@@ -446,10 +428,7 @@ impl Launch<'_> {
         let splats = self.frames.splats();
         let values = self.layout.values();
         let slot_gradients = zeros(self.client, self.state.lists.instances * values);
-        match &self.state.checkpoints {
-            Some(checkpoints) => self.buckets(checkpoints, &slots.of, &slot_gradients),
-            None => self.tiles::<u32>(Sums::Ordered, &slots.of, &slot_gradients, gradients),
-        }
+        self.tiles::<u32>(Sums::Ordered, &slots.of, &slot_gradients, gradients);
         if let Some((count, dim)) = per_element(splats * values) {
             sum_slots::launch(
                 self.client,
@@ -469,53 +448,6 @@ impl Launch<'_> {
                 self.first_channel == 0,
             );
         }
-    }
-
-    /// Bucket by bucket to slots.
-    fn buckets(&self, checkpoints: &Buffer, slots: &Buffer, slot_gradients: &Buffer) {
-        let (inputs, state, frames) = (self.inputs, self.state, self.frames);
-        if state.lists.instances == 0 {
-            return;
-        }
-        let background = inputs.background.clone();
-        let background = background.unwrap_or_else(|| Buffer::empty(self.client, 1));
-        let planes = (8..=BUCKET).contains(&self.plan.lanes());
-        let units = if planes { self.plan.lanes() } else { 8 };
-        sum_behind::launch(
-            self.client,
-            cube_count(frames.tiles()),
-            CubeDim::new_1d(TILE_PIXELS as u32),
-            background.arg(),
-            state.lists.ranges.arg(),
-            state.transmittance.arg(),
-            state.walked.arg(),
-            self.grad_output.arg(),
-            checkpoints.arg(),
-            frames.uniforms(),
-            inputs.channels as u32,
-            inputs.channels,
-            inputs.background.is_some(),
-        );
-        rasterize_backward_per_splat::launch(
-            self.client,
-            cube_count(buckets(state.lists.instances, frames.tiles())),
-            CubeDim::new_1d(units as u32),
-            inputs.packed.arg(),
-            inputs.colors.arg(),
-            inputs.opacities.arg(),
-            state.lists.splats.arg(),
-            slots.arg(),
-            state.lists.ranges.arg(),
-            state.walked.arg(),
-            self.grad_output.arg(),
-            checkpoints.arg(),
-            slot_gradients.arg(),
-            frames.uniforms(),
-            thresholds(frames, self.settings),
-            self.layout,
-            units,
-            planes,
-        );
     }
 
     /// Added to the gradients, which are zero before the first launch.

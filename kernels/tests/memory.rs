@@ -47,7 +47,6 @@ fn a_picture_keeps_the_bytes_that_are_stated() {
                 alpha_max: 0.99,
                 transmittance_min: 9.999e-5,
                 sums,
-                per_splat: false,
             };
             let before = in_use();
             let (image, state) = rasterize(&client, &inputs, &frames, &settings).unwrap();

@@ -58,7 +58,6 @@ fn render(client: &Client, splats: usize, spread: f32) -> (Vec<f32>, Work) {
         alpha_max: 0.99,
         transmittance_min: 9.999e-5,
         sums: Sums::Ordered,
-        per_splat: false,
     };
     let before = work();
     let (image, state) = rasterize(client, &inputs, &frames, &settings).unwrap();

@@ -7,9 +7,8 @@
 use cubecl::prelude::*;
 
 use super::pair::{SHAPE, Shape, Thresholds, UNSEEN, sample};
-use super::per_splat::{TILE_PIXELS, first_bucket};
 use super::tile::{BATCH, Batch, Plan, WORDS, pixel_index, place};
-use crate::intersect::{Grid, TILE};
+use crate::intersect::Grid;
 
 /// One workgroup per tile; `width` channels from `first_channel` on. Counting: instead of what is left of the light and
 /// of the splats walked, every pixel writes how many splats were tested for it and how many it blended, and as its alpha
@@ -25,7 +24,6 @@ pub(super) fn rasterize_forward(
     output: &mut [f32],
     transmittance: &mut [f32],
     walked: &mut [u32],
-    checkpoints: &mut [f32],
     grid: Grid,
     thresholds: Thresholds,
     channels: u32,
@@ -35,7 +33,6 @@ pub(super) fn rasterize_forward(
     #[comptime] has_background: bool,
     #[comptime] first_launch: bool,
     #[comptime] counting: bool,
-    #[comptime] saving: bool,
 ) {
     let pixels = comptime!(plan.pixels());
     let units = comptime!(plan.units());
@@ -115,13 +112,6 @@ pub(super) fn rasterize_forward(
         let was_open = open_pixels > 0u32;
         for word in 0..WORDS {
             let mut bits = batch.bits(place.block, word);
-            let mut own = Array::<f32>::new(comptime!(pixels * width));
-            if comptime!(saving) {
-                #[unroll]
-                for i in 0..comptime!(pixels * width) {
-                    own[i] = 0.0f32;
-                }
-            }
             while bits != 0u32 && open_pixels > 0u32 {
                 let k = word * 32 + bits.trailing_zeros() as usize;
                 bits &= bits - 1u32;
@@ -153,9 +143,6 @@ pub(super) fn rasterize_forward(
                     #[unroll]
                     for channel in 0..width {
                         sums[q * width + channel] += weight * color[channel];
-                        if comptime!(saving) {
-                            own[q * width + channel] += weight * color[channel];
-                        }
                     }
                     t[q] = select(blends, next, t[q]);
                     if comptime!(counting) {
@@ -168,25 +155,6 @@ pub(super) fn rasterize_forward(
                 #[unroll]
                 for q in 0..pixels {
                     open_pixels += open[q];
-                }
-            }
-            if comptime!(saving) {
-                let entry = first + word as u32 * 32u32;
-                if entry < end {
-                    let bucket = first_bucket(start, place.tile) + (entry - start) / 32u32;
-                    let checkpoint = bucket as usize * comptime!(TILE_PIXELS * (width + 1));
-                    #[unroll]
-                    for q in 0..pixels {
-                        let (x, y) = place.pixel(q, plan);
-                        let at = (y - place.tile_y) * TILE + x - place.tile_x;
-                        let at = checkpoint + at as usize;
-                        checkpoints[at] = t[q];
-                        #[unroll]
-                        for channel in 0..width {
-                            checkpoints[at + TILE_PIXELS + channel * TILE_PIXELS] =
-                                own[q * width + channel];
-                        }
-                    }
                 }
             }
         }

@@ -14,7 +14,6 @@ const SETTINGS: RasterizeSettings = RasterizeSettings {
     alpha_max: 0.99,
     transmittance_min: 9.999e-5,
     sums: Sums::Ordered,
-    per_splat: false,
 };
 
 const ALL_SUMS: [Sums; 3] = [Sums::Ordered, Sums::Atomic, Sums::Exchange];
@@ -129,18 +128,9 @@ fn check(name: &str, scene: &Scene, limit: f64) {
             image.iter().zip(&weights).map(|(a, b)| a * b).sum()
         })
     });
-    let ways = ALL_SUMS.map(|sums| (sums, false));
-    for (sums, per_splat) in ways.into_iter().chain([(Sums::Ordered, true)]) {
-        let settings = RasterizeSettings {
-            sums,
-            per_splat,
-            ..SETTINGS
-        };
+    for sums in ALL_SUMS {
+        let settings = RasterizeSettings { sums, ..SETTINGS };
         let (output, state) = rasterize(&client, &inputs, &scene.frames, &settings).unwrap();
-        assert_eq!(
-            state.checkpoints.is_some(),
-            per_splat && scene.channels <= 8
-        );
         assert_close(
             &format!("{name}: image"),
             &download(&client, &output),
@@ -165,7 +155,7 @@ fn check(name: &str, scene: &Scene, limit: f64) {
                 continue;
             };
             assert_close(
-                &format!("{name}: {part}, {sums:?}, by splats {per_splat}"),
+                &format!("{name}: {part}, {sums:?}"),
                 &download(&client, grad),
                 &expected[which],
                 limit,
@@ -533,24 +523,9 @@ fn processor_seconds() -> f64 {
 #[ignore = "a measurement, not a check"]
 fn time_of_the_stages_at_270_by_480() {
     let Some(client) = client() else { return };
-    for (gaussians, inverse_size) in [(15_000, 1.0), (3000, 0.3), (60_000, 3.0)] {
-        println!("{gaussians} splats, {} times as large", 1.0 / inverse_size);
-        time_of_the_stages(&client, gaussians, inverse_size);
-    }
-}
-
-fn time_of_the_stages(client: &cubecl::client::Client, gaussians: usize, inverse_size: f32) {
-    let mut scene = Scene::new(1, gaussians, 270, 480, 3, [0.05, 0.95], 43);
-    for row in scene.packed.chunks_mut(9) {
-        for w in &mut row[3..6] {
-            *w *= inverse_size;
-        }
-        for extent in &mut row[7..9] {
-            *extent /= inverse_size;
-        }
-    }
-    let inputs = scene.inputs(client);
-    let grad = upload(client, &vec![1.0; 270 * 480 * 4]);
+    let scene = Scene::new(1, 15_000, 270, 480, 3, [0.05, 0.95], 43);
+    let inputs = scene.inputs(&client);
+    let grad = upload(&client, &vec![1.0; 270 * 480 * 4]);
     for round in 0..4 {
         let mut at = processor_seconds();
         let mut lap = |name: &str| {
@@ -560,52 +535,33 @@ fn time_of_the_stages(client: &cubecl::client::Client, gaussians: usize, inverse
         };
         print!("round {round}: ");
         let lists = splat_kernels::intersect::intersect(
-            client,
+            &client,
             &inputs.packed,
             &inputs.opacities,
             &scene.frames,
         )
         .unwrap();
-        download_u32(client, &lists.ranges);
+        download_u32(&client, &lists.ranges);
         lap("intersect");
-        let mut state = None;
-        for (per_splat, sums) in [
-            (false, Sums::Ordered),
-            (true, Sums::Ordered),
-            (false, Sums::Atomic),
-        ] {
-            let settings = RasterizeSettings {
-                per_splat,
-                sums,
-                ..SETTINGS
-            };
-            let before = splat_kernels::work().reserved_bytes;
-            let bytes = || splat_kernels::work().reserved_bytes - before;
-            let (output, done) = rasterize(client, &inputs, &scene.frames, &settings).unwrap();
-            download(client, &output);
-            lap(&format!(
-                "{per_splat} {sums:?} intersect + forward, {} MB,",
-                bytes() >> 20
-            ));
-            let grads = rasterize_vjp(
-                client,
-                &inputs,
-                &done,
-                &grad,
-                &scene.frames,
-                &settings,
-                [true; 4],
-            );
-            download(client, grads[2].as_ref().unwrap());
-            lap(&format!("backward, {} MB,", bytes() >> 20));
-            state = Some(done);
-        }
-        let state = state.unwrap();
+        let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
+        download(&client, &output);
+        lap("intersect + forward");
+        let grads = rasterize_vjp(
+            &client,
+            &inputs,
+            &state,
+            &grad,
+            &scene.frames,
+            &SETTINGS,
+            [true; 4],
+        );
+        download(&client, grads[2].as_ref().unwrap());
+        lap("backward");
         println!("{} instances", lists.instances);
         if round == 3 {
             let count =
-                count_evaluations(client, &inputs, &state, &scene.frames, &SETTINGS).unwrap();
-            let walked = download_u32(client, &state.walked);
+                count_evaluations(&client, &inputs, &state, &scene.frames, &SETTINGS).unwrap();
+            let walked = download_u32(&client, &state.walked);
             let walked: u64 = walked.into_iter().map(u64::from).sum();
             println!("{count:?}; {walked} splats of their tiles' lists were walked by all pixels");
         }

@@ -25,7 +25,6 @@ fn settings(settings: &crate::RasterizeSettings) -> RasterizeSettings {
         } else {
             Sums::Atomic
         },
-        per_splat: false,
     }
 }
 
