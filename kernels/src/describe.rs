@@ -37,6 +37,10 @@ pub fn describe(client: &Client) -> Vec<(&'static str, String)> {
         facts.push(("last cache", format!("{bytes} bytes")));
     }
     facts.push(("rasterize", rasterize::variant(client)));
+    facts.push((
+        "sums without order",
+        rasterize::unordered(client).to_owned(),
+    ));
     facts.push(("sort", sort::variant(client)));
     facts
 }

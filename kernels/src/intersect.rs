@@ -94,10 +94,17 @@ pub struct TileLists {
     pub instances: usize,
     /// Splat (camera N + Gaussian) of every instance, by tile, front to back; there may be room for more.
     pub splats: Buffer,
-    /// Slot of every instance, in the same order.
-    pub slots: Buffer,
     /// First instance and end of every tile [tiles, 2].
     pub ranges: Buffer,
+    /// Only sums in order need them.
+    pub slots: Option<Slots>,
+}
+
+/// A slot for every instance, those of one splat side by side.
+#[derive(Clone, Debug)]
+pub struct Slots {
+    /// Slot of every instance, in the order of the tiles' lists.
+    pub of: Buffer,
     /// How many splats of a lower index are visible; at the end how many there are, V [splats + 1].
     pub visible: Buffer,
     /// The visible splats, front to back: V of them, in memory for all.
@@ -753,11 +760,13 @@ impl<'a> Counted<'a> {
         TileLists {
             instances: capacity,
             splats: tile_splats,
-            slots,
             ranges,
-            visible: self.visible.clone(),
-            order: self.order.clone(),
-            offsets: self.offsets.clone(),
+            slots: Some(Slots {
+                of: slots,
+                visible: self.visible.clone(),
+                order: self.order.clone(),
+                offsets: self.offsets.clone(),
+            }),
         }
     }
 }

@@ -9,7 +9,8 @@
 //! [`copy`] how fast the device's memory is.
 //!
 //! Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous, row-major) and launch kernels without
-//! waiting, except where they say so. Sums never use float atomics: the same input gives the same bits on one device.
+//! waiting, except where they say so. The same input gives the same bits on one device, unless a caller asks the
+//! rasteriser for sums without order ([`rasterize::Sums`]).
 
 // `if comptime!(...)` decides while a kernel is built; joined to a condition on the device it would decide there.
 #![allow(clippy::collapsible_if)]

@@ -11,8 +11,9 @@
 //! ```text
 //! dL/dcolour = T alpha g,   dL/dalpha = T (colour · g) - behind / (1 - alpha)     (0 at the cap)
 //! ```
-//! Gradients of one (tile, splat) pair are summed over the tile's pixels in fixed order and written to the pair's own
-//! slot; then the slots of every splat are summed in order. No atomics on floats: the same bits every time.
+//! Gradients of one (tile, splat) pair are summed over the tile's pixels in fixed order. By default each pair writes to
+//! its own slot, and then the slots of every splat are summed in order: the same bits every time. [`Sums`] has the other
+//! way, without slots.
 //!
 //! Any number of channels: those beyond what one launch can do (at most [`MAX_CHANNELS`]) go in further ones.
 
@@ -20,17 +21,20 @@ mod background;
 mod backward;
 mod forward;
 mod pair;
+mod sums;
 mod tile;
 
 use cubecl::prelude::*;
 
 use self::background::background_gradient;
-use self::backward::{SHAPE_GRADIENTS, SlotLayout, rasterize_backward, sum_slots};
+use self::backward::{SHAPE_GRADIENTS, SlotLayout, rasterize_backward};
 use self::forward::rasterize_forward;
 use self::pair::thresholds;
+pub use self::sums::Sums;
+use self::sums::sum_slots;
 use self::tile::Plan;
 use crate::floor::{Bytes, Sizes};
-use crate::intersect::{Frames, IntersectError, TileLists, intersect_ahead};
+use crate::intersect::{Frames, IntersectError, Slots, TileLists, intersect_ahead};
 use crate::launch::{Buffer, cube_count, per_element};
 use crate::math::is_finite;
 use crate::project::PACKED;
@@ -49,19 +53,21 @@ fn slot_channels(most: usize, bytes: u64, instances: usize) -> usize {
     values.saturating_sub(SHAPE_GRADIENTS).clamp(1, most)
 }
 
-/// Thresholds of the blending.
+/// Thresholds of the blending, and how its gradients are summed.
 #[derive(Clone, Copy, Debug)]
 pub struct RasterizeSettings {
     /// Cap of alpha.
     pub alpha_max: f32,
     /// A pixel stops before its transmittance falls below this.
     pub transmittance_min: f32,
+    /// How gradients of one splat from many tiles are summed.
+    pub sums: Sums,
 }
 
 /// What a forward pass leaves for its backward pass.
 #[derive(Clone, Debug)]
 pub struct RasterizeState {
-    /// The tiles' lists.
+    /// The tiles' lists; without slots where the forward pass was to expect no sums in order.
     pub lists: TileLists,
     /// Transmittance that is left of every pixel [C, H, W].
     pub transmittance: Buffer,
@@ -135,10 +141,14 @@ pub fn rasterize(
     settings: &RasterizeSettings,
 ) -> Result<(Buffer, RasterizeState), IntersectError> {
     let opacities = without_broken_colors(client, inputs, frames);
-    let (lists, blended) = intersect_ahead(client, &inputs.packed, &opacities, frames, |lists| {
-        blend(client, inputs, lists, frames, settings, false)
-    })?;
+    let (mut lists, blended) =
+        intersect_ahead(client, &inputs.packed, &opacities, frames, |lists| {
+            blend(client, inputs, lists, frames, settings, false)
+        })?;
     let [output, transmittance, walked] = blended;
+    if settings.sums != Sums::Ordered {
+        lists.slots = None;
+    }
     let state = RasterizeState {
         lists,
         transmittance,
@@ -192,7 +202,7 @@ fn blend(
     [output, transmittance, walked]
 }
 
-/// What forward and gradient must move for one camera, with lists that are there.
+/// What forward and gradient must move for one camera, with lists that are there; the gradient summed in order.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let (i, pixels, color) = (sizes.instances, sizes.pixels(), 4 * sizes.channels);
     // In the gradient: its sums per instance, written and read again, and what becomes of them per Gaussian.
@@ -215,18 +225,34 @@ pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
 pub struct Kept;
 
 impl Kept {
-    /// Place in the order of depth, and where the slots begin, twice: by splat and by place.
-    pub const PER_SPLAT: u64 = 12;
-    /// Splat and slot, of all instances that there was room for: up to a quarter more than there are.
-    pub const PER_INSTANCE: u64 = 8;
     /// Where the list begins and ends.
     pub const PER_TILE: u64 = 8;
     /// What is left of the light, and how many splats were walked. The image has four bytes per channel and for alpha.
     pub const PER_PIXEL: u64 = 8;
 
+    /// For sums in order: place in the order of depth, and where the slots begin, twice: by splat and by place.
+    pub const fn per_splat(sums: Sums) -> u64 {
+        match sums {
+            Sums::Ordered => 12,
+            Sums::Atomic | Sums::Exchange => 0,
+        }
+    }
+
+    /// Splat, and for sums in order the slot, of all instances that there was room for: up to a quarter more than there
+    /// are.
+    pub const fn per_instance(sums: Sums) -> u64 {
+        match sums {
+            Sums::Ordered => 8,
+            Sums::Atomic | Sums::Exchange => 4,
+        }
+    }
+
     /// Bytes per instance that the gradient takes while it is made.
-    pub const fn gradient_per_instance(channels: u64) -> u64 {
-        4 * (SHAPE_GRADIENTS as u64 + channels)
+    pub const fn gradient_per_instance(channels: u64, sums: Sums) -> u64 {
+        match sums {
+            Sums::Ordered => 4 * (SHAPE_GRADIENTS as u64 + channels),
+            Sums::Atomic | Sums::Exchange => 0,
+        }
     }
 }
 
@@ -243,6 +269,14 @@ pub fn variant(client: &Client) -> String {
         plan.blocks(),
         plan.channels()
     )
+}
+
+/// What [`Sums::Atomic`] is on this device, in words.
+pub fn unordered(client: &Client) -> &'static str {
+    match Sums::Atomic.unordered(client) {
+        Sums::Exchange => "atomic exchanges",
+        _ => "atomic additions of floats",
+    }
 }
 
 /// (Pixel, splat) pairs of a forward pass.
@@ -297,7 +331,7 @@ fn zeros(client: &Client, len: usize) -> Buffer {
 }
 
 /// Gradients of packed splats [C, N, 9], colours [C, N, D], opacities [C, N] and background [C, D] for the gradient of
-/// the output [C, H, W, D + 1]; only those `wanted`.
+/// the output [C, H, W, D + 1]; only those `wanted`. In order if `state` has slots.
 pub fn rasterize_vjp(
     client: &Client,
     inputs: &RasterizeInputs,
@@ -316,72 +350,55 @@ pub fn rasterize_vjp(
         wants_background,
     ] = wanted;
     let shape = wants_packed || wants_opacities;
-    let reserve = |needed: bool, len: usize| Buffer::empty(client, if needed { len } else { 1 });
-    let grad_packed = reserve(shape, splats * PACKED);
-    let grad_colors = reserve(wants_colors, splats * channels);
-    let grad_opacities = reserve(shape, splats);
     let lists = &state.lists;
-    let plan = Plan::new(client);
+    let sums = match lists.slots {
+        Some(_) => Sums::Ordered,
+        None => settings.sums.unordered(client),
+    };
+    let reserve = |needed: bool, len: usize| match sums {
+        _ if !needed => Buffer::empty(client, 1),
+        // Every element is written.
+        Sums::Ordered => Buffer::empty(client, len),
+        Sums::Atomic | Sums::Exchange => zeros(client, len),
+    };
+    let gradients = [
+        reserve(shape, splats * PACKED),
+        reserve(wants_colors, splats * channels),
+        reserve(shape, splats),
+    ];
 
     if shape || wants_colors {
-        let background = inputs.background.clone();
-        let background = background.unwrap_or_else(|| Buffer::empty(client, 1));
+        let plan = Plan::new(client);
         let page = client.properties().memory.max_page_size;
-        let width = slot_channels(plan.channels(), page, lists.instances);
+        let width = match sums {
+            Sums::Ordered => slot_channels(plan.channels(), page, lists.instances),
+            Sums::Atomic | Sums::Exchange => plan.channels(),
+        };
         for first_channel in (0..channels).step_by(width) {
             let layout = SlotLayout {
                 shape,
                 colors: wants_colors,
                 width: width.min(channels - first_channel),
             };
-            let slot_gradients = zeros(client, lists.instances * layout.values());
-            if lists.instances > 0 {
-                rasterize_backward::launch(
-                    client,
-                    cube_count(frames.tiles()),
-                    plan.cube_dim(),
-                    inputs.packed.arg(),
-                    inputs.colors.arg(),
-                    inputs.opacities.arg(),
-                    background.arg(),
-                    lists.splats.arg(),
-                    lists.slots.arg(),
-                    lists.ranges.arg(),
-                    state.transmittance.arg(),
-                    state.walked.arg(),
-                    grad_output.arg(),
-                    slot_gradients.arg(),
-                    frames.uniforms(),
-                    thresholds(frames, settings),
-                    channels as u32,
-                    first_channel as u32,
-                    plan,
-                    layout,
-                    inputs.background.is_some(),
-                    first_channel == 0,
-                );
-            }
-            if let Some((count, dim)) = per_element(splats * layout.values()) {
-                sum_slots::launch(
-                    client,
-                    count,
-                    dim,
-                    slot_gradients.arg(),
-                    lists.visible.arg(),
-                    lists.order.arg(),
-                    lists.offsets.arg(),
-                    grad_packed.arg(),
-                    grad_colors.arg(),
-                    grad_opacities.arg(),
-                    splats as u32,
-                    channels as u32,
-                    first_channel as u32,
-                    layout,
-                    first_channel == 0,
-                );
+            let launch = Launch {
+                client,
+                inputs,
+                state,
+                grad_output,
+                frames,
+                settings,
+                plan,
+                layout,
+                first_channel,
+            };
+            match &lists.slots {
+                Some(slots) => launch.in_order(slots, &gradients),
+                None if sums == Sums::Atomic => launch.as_they_come::<f32>(sums, &gradients),
+                None => launch.as_they_come::<u32>(sums, &gradients),
             }
         }
     }
+    let [grad_packed, grad_colors, grad_opacities] = gradients;
     [
         wants_packed.then_some(grad_packed),
         wants_colors.then_some(grad_colors),
@@ -389,6 +406,99 @@ pub fn rasterize_vjp(
         (wants_background && inputs.background.is_some())
             .then(|| background_gradient(client, state, grad_output, channels, frames)),
     ]
+}
+
+/// Some channels of the backward pass, as many as a launch can do.
+struct Launch<'a> {
+    client: &'a Client,
+    inputs: &'a RasterizeInputs,
+    state: &'a RasterizeState,
+    grad_output: &'a Buffer,
+    frames: &'a Frames,
+    settings: &'a RasterizeSettings,
+    plan: Plan,
+    layout: SlotLayout,
+    first_channel: usize,
+}
+
+impl Launch<'_> {
+    /// To slots, and these to the gradients of packed splats, colours and opacities.
+    fn in_order(&self, slots: &Slots, gradients: &[Buffer; 3]) {
+        let [grad_packed, grad_colors, grad_opacities] = gradients;
+        let splats = self.frames.splats();
+        let values = self.layout.values();
+        let slot_gradients = zeros(self.client, self.state.lists.instances * values);
+        self.tiles::<u32>(Sums::Ordered, &slots.of, &slot_gradients, gradients);
+        if let Some((count, dim)) = per_element(splats * values) {
+            sum_slots::launch(
+                self.client,
+                count,
+                dim,
+                slot_gradients.arg(),
+                slots.visible.arg(),
+                slots.order.arg(),
+                slots.offsets.arg(),
+                grad_packed.arg(),
+                grad_colors.arg(),
+                grad_opacities.arg(),
+                splats as u32,
+                self.inputs.channels as u32,
+                self.first_channel as u32,
+                self.layout,
+                self.first_channel == 0,
+            );
+        }
+    }
+
+    /// Added to the gradients, which are zero before the first launch.
+    fn as_they_come<A: Numeric>(&self, sums: Sums, gradients: &[Buffer; 3]) {
+        let none = [(); 2].map(|()| Buffer::empty(self.client, 1));
+        self.tiles::<A>(sums, &none[0], &none[1], gradients);
+    }
+
+    fn tiles<A: Numeric>(
+        &self,
+        sums: Sums,
+        slots: &Buffer,
+        slot_gradients: &Buffer,
+        gradients: &[Buffer; 3],
+    ) {
+        let (inputs, state, frames) = (self.inputs, self.state, self.frames);
+        let [grad_packed, grad_colors, grad_opacities] = gradients;
+        if state.lists.instances == 0 {
+            return;
+        }
+        let background = inputs.background.clone();
+        let background = background.unwrap_or_else(|| Buffer::empty(self.client, 1));
+        rasterize_backward::launch::<A>(
+            self.client,
+            cube_count(frames.tiles()),
+            self.plan.cube_dim(),
+            inputs.packed.arg(),
+            inputs.colors.arg(),
+            inputs.opacities.arg(),
+            background.arg(),
+            state.lists.splats.arg(),
+            slots.arg(),
+            state.lists.ranges.arg(),
+            state.transmittance.arg(),
+            state.walked.arg(),
+            self.grad_output.arg(),
+            slot_gradients.arg(),
+            grad_packed.arg(),
+            grad_colors.arg(),
+            grad_opacities.arg(),
+            frames.uniforms(),
+            thresholds(frames, self.settings),
+            inputs.channels as u32,
+            self.first_channel as u32,
+            self.plan,
+            self.layout,
+            sums,
+            inputs.background.is_some(),
+            self.first_channel == 0,
+        );
+    }
 }
 
 #[cfg(test)]

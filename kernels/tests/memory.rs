@@ -8,8 +8,10 @@ mod alone;
 use alone::alone;
 use cubecl::MemoryScope;
 use splat_kernels::intersect::Frames;
-use splat_kernels::rasterize::{Kept, RasterizeInputs, RasterizeSettings, rasterize};
-use splat_kernels::{Buffer, copy};
+use splat_kernels::rasterize::{
+    Kept, RasterizeInputs, RasterizeSettings, Sums, rasterize, rasterize_vjp,
+};
+use splat_kernels::{Buffer, copy, work};
 
 #[test]
 fn a_picture_keeps_the_bytes_that_are_stated() {
@@ -40,24 +42,37 @@ fn a_picture_keeps_the_bytes_that_are_stated() {
             background: None,
             channels: 1,
         };
-        let settings = RasterizeSettings {
-            alpha_max: 0.99,
-            transmittance_min: 9.999e-5,
-        };
-        let before = in_use();
-        let (image, state) = rasterize(&client, &inputs, &frames, &settings).unwrap();
-        image.read_f32(&client).unwrap();
-        let used = in_use() - before;
-        let room = state.lists.splats.len() as u64;
-        // The image has one channel and alpha.
-        let stated = Kept::PER_SPLAT * splats as u64
-            + Kept::PER_INSTANCE * room
-            + Kept::PER_TILE * frames.tiles() as u64
-            + (Kept::PER_PIXEL + 8) * u64::from(width) * 128;
-        println!("{splats} splats, {room} instances: {used} bytes, stated {stated}");
-        assert!(room >= state.lists.instances as u64 && room > 0);
-        // What went with the last launches is still there: so many bytes whatever the sizes.
-        assert!((stated..stated + 4096).contains(&used));
+        for sums in [Sums::Ordered, Sums::Atomic, Sums::Exchange] {
+            let settings = RasterizeSettings {
+                alpha_max: 0.99,
+                transmittance_min: 9.999e-5,
+                sums,
+            };
+            let before = in_use();
+            let (image, state) = rasterize(&client, &inputs, &frames, &settings).unwrap();
+            image.read_f32(&client).unwrap();
+            let used = in_use() - before;
+            let room = state.lists.splats.len() as u64;
+            // The image has one channel and alpha.
+            let stated = Kept::per_splat(sums) * splats as u64
+                + Kept::per_instance(sums) * room
+                + Kept::PER_TILE * frames.tiles() as u64
+                + (Kept::PER_PIXEL + 8) * u64::from(width) * 128;
+            println!("{splats} splats, {room} instances, {sums:?}: {used} bytes, stated {stated}");
+            assert!(room >= state.lists.instances as u64 && room > 0);
+            // What went with the last launches is still there: so many bytes whatever the sizes.
+            assert!((stated..stated + 4096).contains(&used));
+
+            let before = work().reserved_bytes;
+            let wanted = [true, true, true, false];
+            rasterize_vjp(&client, &inputs, &state, &image, &frames, &settings, wanted);
+            let reserved = work().reserved_bytes - before;
+            // Gradients of nine floats of a packed splat, one colour and the opacity; and what stands for a missing input.
+            let stated = 44 * splats as u64
+                + Kept::gradient_per_instance(1, sums) * state.lists.instances as u64;
+            println!("gradient: {reserved} bytes, stated {stated}");
+            assert!((stated..=stated + 12).contains(&reserved));
+        }
     }
 }
 

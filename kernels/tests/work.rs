@@ -10,7 +10,7 @@ use cubecl::client::Client;
 use splat_kernels::activation::{Activation, activate};
 use splat_kernels::adam::{AdamRows, AdamStep, adam};
 use splat_kernels::intersect::Frames;
-use splat_kernels::rasterize::{RasterizeInputs, RasterizeSettings, rasterize};
+use splat_kernels::rasterize::{RasterizeInputs, RasterizeSettings, Sums, rasterize};
 use splat_kernels::screen_statistics::screen_statistics;
 use splat_kernels::{Buffer, Work, scan, work};
 
@@ -58,6 +58,7 @@ fn render(client: &Client, splats: usize, spread: f32) -> (Vec<f32>, Work) {
     let settings = RasterizeSettings {
         alpha_max: 0.99,
         transmittance_min: 9.999e-5,
+        sums: Sums::Ordered,
     };
     let before = work();
     let (image, state) = rasterize(client, &inputs, &frames, &settings).unwrap();

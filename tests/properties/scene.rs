@@ -229,6 +229,7 @@ pub fn thresholds() -> impl Strategy<Value = RasterizeSettings> {
             alpha_min,
             alpha_max,
             transmittance_min,
+            ..RasterizeSettings::default()
         },
     );
     prop_oneof![3 => any, 1 => Just(RasterizeSettings::default())]

@@ -54,6 +54,12 @@ pub struct RasterizeSettings {
     /// 3DGS appendix C less one part in 10,000, because two splats at the cap leave exactly 1e-4,
     /// which rounds to either side.
     pub transmittance_min: f64,
+    /// Whether the same input gives the same gradients, bit for bit, every time. Default true. False, on a CubeCL device:
+    /// the tiles' shares of a splat's gradient are added up as they come, which differs from run to run in the last digits.
+    /// It saves memory, 24 bytes and 4 per channel of each (splat, tile) pair in the backward pass, and from the forward
+    /// pass on 4 of each pair and 12 of each Gaussian and camera; docs/GPU.md has what it does to the time. The CPU sums
+    /// in order in any case.
+    pub deterministic: bool,
 }
 
 impl Default for RasterizeSettings {
@@ -62,6 +68,7 @@ impl Default for RasterizeSettings {
             alpha_min: ALPHA_MIN,
             alpha_max: 0.99,
             transmittance_min: 9.999e-5,
+            deterministic: true,
         }
     }
 }

@@ -281,7 +281,14 @@ fn benches_of_speed_measure_a_device_too() {
     let median = |name: &str| row[name]["median"].as_f64().unwrap();
     assert!(median("render_forward_milliseconds") > 0.0);
     assert!(median("render_backward_milliseconds") > 0.0);
-    assert!(row["forward"]["tested_per_second"].as_f64().unwrap() > 0.0);
+    for rate in ["forward", "backward", "backward_unordered"] {
+        assert!(row[rate]["tested_per_second"].as_f64().unwrap() > 0.0);
+    }
+    // Of one pass: the ratio is that of its two times.
+    let [ordered, unordered] = ["backward", "backward_unordered"]
+        .map(|name| row[name]["milliseconds"]["median"].as_f64().unwrap());
+    let ratio = median("cost_of_order") * unordered / ordered;
+    assert!(row["passes"] != 1 || (ratio - 1.0).abs() < 1e-9, "{row}");
     let facts = rasterize["device"].as_array().unwrap();
     assert!(facts.iter().any(|fact| fact[0] == "planes"), "{facts:?}");
 

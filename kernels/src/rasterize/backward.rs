@@ -1,22 +1,23 @@
-//! The gradient of every (tile, splat) pair, back to front, and its sum over the tiles of every splat.
+//! The gradient of every (tile, splat) pair, back to front; `sums.rs` has what becomes of it.
 //!
 //! With g = dL/dsigma of one pixel, all gradients of a splat's shape follow from six sums over pixels:
 //! ```text
 //! A = Σ g,  B = Σ g z1,  C = Σ g z2,  D = Σ g z1 dx,  E = Σ g z2 dx,  F = Σ g z2 dy
 //! dL/dw11 = D,  dL/dw21 = E,  dL/dw22 = F,  dL/dmean = -(w11 B + w21 C, w22 C),  dL/do = -A / o
 //! ```
-//! Each block sums its pixels, the tile its blocks (in order), and each splat its tiles (in order).
+//! Each block sums its pixels, and the tile its blocks (in order). One value of a pair goes to its slot, or is added to
+//! the splat's gradient at once.
 //!
 //! Floor per (block, splat) pair: as forward, plus 24 bytes and 4 per channel to shared memory; per pixel of the block
-//! about 45 operations and 4 per channel. Per (tile, splat) pair: 32 bytes and 4 per channel from memory, 24 and 4 per
-//! channel to it, and once more from it for the sum.
+//! about 45 operations and 4 per channel. Per (tile, splat) pair: 32 bytes and 4 per channel from memory (28 without
+//! slots), and what `sums.rs` counts.
 
 use cubecl::prelude::*;
 
 use super::pair::{SHAPE, Shape, Thresholds, UNSEEN, sample};
+use super::sums::{Sums, add_to_splat};
 use super::tile::{BATCH, Batch, Plan, WORDS, pixel_index, place};
 use crate::intersect::Grid;
-use crate::project::PACKED;
 
 /// Gradients of a splat's shape and opacity in a slot, in the order of [`SHAPE`]; those of colours follow.
 pub(super) const SHAPE_GRADIENTS: usize = SHAPE;
@@ -42,11 +43,11 @@ impl SlotLayout {
         self.first_color() + if self.colors { self.width } else { 0 }
     }
 
-    fn first_color(self) -> usize {
+    pub fn first_color(self) -> usize {
         if self.shape { SHAPE_GRADIENTS } else { 0 }
     }
 
-    /// Floats in shared memory beside the partial sums: the batch, its slots and bits, and how far the blocks have walked.
+    /// Floats in shared memory beside the partial sums: the batch, its targets and bits, and how far the blocks have walked.
     fn batch(self, plan: Plan) -> usize {
         BATCH * (SHAPE + self.width) + 2 * BATCH + plan.blocks() * (WORDS + 1) + 2
     }
@@ -60,9 +61,10 @@ impl SlotLayout {
     }
 }
 
-/// Gradients of every (tile, splat) pair, to the pair's slot: one workgroup per tile, back to front.
+/// Gradients of every (tile, splat) pair: one workgroup per tile, back to front. They go to `slot_gradients`, or are added
+/// to the three that follow it, as `sums` says; nothing reads or writes the other, nor, without slots, `slots`.
 #[cube(launch)]
-pub(super) fn rasterize_backward(
+pub(super) fn rasterize_backward<A: Numeric>(
     packed: &[f32],
     colors: &[f32],
     opacities: &[f32],
@@ -74,12 +76,16 @@ pub(super) fn rasterize_backward(
     walked: &[u32],
     grad_output: &[f32],
     slot_gradients: &mut [f32],
+    grad_packed: &[Atomic<A>],
+    grad_colors: &[Atomic<A>],
+    grad_opacities: &[Atomic<A>],
     grid: Grid,
     thresholds: Thresholds,
     channels: u32,
     first_channel: u32,
     #[comptime] plan: Plan,
     #[comptime] layout: SlotLayout,
+    #[comptime] sums: Sums,
     #[comptime] has_background: bool,
     #[comptime] first_launch: bool,
 ) {
@@ -91,7 +97,8 @@ pub(super) fn rasterize_backward(
     let blocks = comptime!(plan.blocks());
 
     let mut batch = Batch::new(plan, width);
-    let mut batch_slots = Shared::new_slice(BATCH);
+    // Of every splat of the batch: its slot, or without slots its index.
+    let mut targets = Shared::new_slice(BATCH);
     // Place k of the group, value, block.
     let mut partials = Shared::new_slice(comptime!(group * values * blocks));
     let mut start = Shared::new_slice(1usize);
@@ -166,7 +173,11 @@ pub(super) fn rasterize_backward(
             let at = (start + entry) as usize;
             let splat = splats[at] as usize;
             let color = splat * channels as usize + first_channel as usize;
-            batch_slots[k as usize] = slots[at];
+            targets[k as usize] = if comptime!(sums == Sums::Ordered) {
+                slots[at]
+            } else {
+                splats[at]
+            };
             batch.load(
                 packed, colors, opacities, splat, color, k as usize, entry, &ends, grid, place,
                 plan, width,
@@ -276,13 +287,30 @@ pub(super) fn rasterize_backward(
             while row < comptime!(group * values) {
                 let k = from as usize + row / values;
                 if k < count as usize {
+                    let target = targets[k] as usize;
                     let mut touched = batch.touched[k];
+                    let walked = touched != 0u32;
                     let mut sum = 0.0f32;
                     while touched != 0u32 {
                         sum += partials[row * blocks + touched.trailing_zeros() as usize];
                         touched &= touched - 1u32;
                     }
-                    slot_gradients[batch_slots[k] as usize * values + row % values] = sum;
+                    if comptime!(sums == Sums::Ordered) {
+                        slot_gradients[target * values + row % values] = sum;
+                    } else if walked {
+                        add_to_splat(
+                            grad_packed,
+                            grad_colors,
+                            grad_opacities,
+                            target,
+                            row % values,
+                            sum,
+                            channels as usize,
+                            first_channel as usize,
+                            layout,
+                            sums,
+                        );
+                    }
                 }
                 row += units;
             }
@@ -290,103 +318,6 @@ pub(super) fn rasterize_backward(
             from += comptime!(group as u32);
         }
         remaining -= count;
-    }
-}
-
-/// Sums the slots of every visible splat in order, and spreads them over the gradients; those of the others are zero. One
-/// unit per (splat, value).
-#[cube(launch)]
-pub(super) fn sum_slots(
-    slot_gradients: &[f32],
-    visible: &[u32],
-    order: &[u32],
-    offsets: &[u32],
-    grad_packed: &mut [f32],
-    grad_colors: &mut [f32],
-    grad_opacities: &mut [f32],
-    splats: u32,
-    channels: u32,
-    first_channel: u32,
-    #[comptime] layout: SlotLayout,
-    #[comptime] first_launch: bool,
-) {
-    let values = comptime!(layout.values());
-    let j = ABSOLUTE_POS / values;
-    let value = ABSOLUTE_POS % values;
-    if j < splats as usize {
-        if j < visible[splats as usize] as usize {
-            let mut sum = 0.0f32;
-            for slot in offsets[j]..offsets[j + 1] {
-                sum += slot_gradients[slot as usize * values + value];
-            }
-            spread(
-                grad_packed,
-                grad_colors,
-                grad_opacities,
-                order[j] as usize,
-                value,
-                sum,
-                channels as usize,
-                first_channel as usize,
-                layout,
-                first_launch,
-            );
-        }
-        // The same unit, as that of a splat by its index.
-        if visible[j] == visible[j + 1] {
-            spread(
-                grad_packed,
-                grad_colors,
-                grad_opacities,
-                j,
-                value,
-                0.0f32,
-                channels as usize,
-                first_channel as usize,
-                layout,
-                first_launch,
-            );
-        }
-    }
-}
-
-/// Puts one summed value of `splat` where it belongs.
-#[cube]
-fn spread(
-    grad_packed: &mut [f32],
-    grad_colors: &mut [f32],
-    grad_opacities: &mut [f32],
-    splat: usize,
-    value: usize,
-    sum: f32,
-    channels: usize,
-    first_channel: usize,
-    #[comptime] layout: SlotLayout,
-    #[comptime] first_launch: bool,
-) {
-    if value >= comptime!(layout.first_color()) {
-        let channel = first_channel + value - comptime!(layout.first_color());
-        if comptime!(layout.colors) {
-            grad_colors[splat * channels + channel] = sum;
-        }
-    } else if comptime!(layout.shape) {
-        // Shape: mean x, y are entries 0, 1 of a packed splat; w11, w21, w22 are 3, 4, 5.
-        let at = splat * PACKED + select(value < 2, value, value + 1);
-        if comptime!(first_launch) {
-            if value == 5 {
-                grad_opacities[splat] = sum;
-            } else {
-                grad_packed[at] = sum;
-            }
-            if value < 4 {
-                // The entries without gradient: depth, compensation, extents.
-                grad_packed[splat * PACKED + select(value == 0, 2usize, value + 5)] = 0.0f32;
-            }
-        } else if value == 5 {
-            grad_opacities[splat] += sum;
-        } else {
-            grad_packed[at] += sum;
-        }
     }
 }
 

@@ -237,12 +237,13 @@ fn slots_of_a_splat_are_consecutive_and_name_its_instances() {
         return;
     };
     let client = client().unwrap();
+    let slots = lists.slots.as_ref().unwrap();
     let [splats, slots, visible, order, offsets] = [
         &lists.splats,
-        &lists.slots,
-        &lists.visible,
-        &lists.order,
-        &lists.offsets,
+        &slots.of,
+        &slots.visible,
+        &slots.order,
+        &slots.offsets,
     ]
     .map(|b| download_u32(&client, b));
     let mut owner = vec![u32::MAX; lists.instances];

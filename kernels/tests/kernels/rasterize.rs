@@ -2,7 +2,7 @@
 
 use splat_kernels::intersect::Frames;
 use splat_kernels::rasterize::{
-    RasterizeInputs, RasterizeSettings, count_evaluations, rasterize, rasterize_vjp,
+    RasterizeInputs, RasterizeSettings, Sums, count_evaluations, rasterize, rasterize_vjp,
 };
 
 use crate::device::{
@@ -13,7 +13,10 @@ use crate::reference::{self, View};
 const SETTINGS: RasterizeSettings = RasterizeSettings {
     alpha_max: 0.99,
     transmittance_min: 9.999e-5,
+    sums: Sums::Ordered,
 };
+
+const ALL_SUMS: [Sums; 3] = [Sums::Ordered, Sums::Atomic, Sums::Exchange];
 
 struct Scene {
     frames: Frames,
@@ -108,55 +111,56 @@ impl Scene {
     }
 }
 
-/// Forward and all gradients against float64 within `limit`.
+/// Forward and all gradients, in every way of summing them, against float64 within `limit`.
 fn check(name: &str, scene: &Scene, limit: f64) {
     let Some(client) = client() else { return };
     let inputs = scene.inputs(&client);
     let wide_scene = scene.wide();
-    let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
-    assert_close(
-        &format!("{name}: image"),
-        &download(&client, &output),
-        &scene.reference(&wide_scene),
-        1e-6,
-    );
-
-    let weights = uniform(&mut rng(30), output.len(), -1.0, 1.0);
+    let image = scene.reference(&wide_scene);
+    let weights = uniform(&mut rng(30), image.len(), -1.0, 1.0);
     let grad_output = upload(&client, &weights);
-    let grads = rasterize_vjp(
-        &client,
-        &inputs,
-        &state,
-        &grad_output,
-        &scene.frames,
-        &SETTINGS,
-        [true; 4],
-    );
     let weights = wide(&weights);
-    for (which, part) in ["packed", "colors", "opacities", "background"]
-        .iter()
-        .enumerate()
-    {
-        let Some(grad) = &grads[which] else {
-            assert!(*part == "background" && scene.background.is_none());
-            continue;
-        };
-        let expected = differences(&wide_scene[which], 1e-7, |x| {
+    let expected = [0, 1, 2, 3].map(|which| {
+        differences(&wide_scene[which], 1e-7, |x| {
             let mut moved = wide_scene.clone();
             moved[which] = x.to_vec();
-            scene
-                .reference(&moved)
-                .iter()
-                .zip(&weights)
-                .map(|(a, b)| a * b)
-                .sum()
-        });
+            let image = scene.reference(&moved);
+            image.iter().zip(&weights).map(|(a, b)| a * b).sum()
+        })
+    });
+    for sums in ALL_SUMS {
+        let settings = RasterizeSettings { sums, ..SETTINGS };
+        let (output, state) = rasterize(&client, &inputs, &scene.frames, &settings).unwrap();
         assert_close(
-            &format!("{name}: {part}"),
-            &download(&client, grad),
-            &expected,
-            limit,
+            &format!("{name}: image"),
+            &download(&client, &output),
+            &image,
+            1e-6,
         );
+        let grads = rasterize_vjp(
+            &client,
+            &inputs,
+            &state,
+            &grad_output,
+            &scene.frames,
+            &settings,
+            [true; 4],
+        );
+        for (which, part) in ["packed", "colors", "opacities", "background"]
+            .iter()
+            .enumerate()
+        {
+            let Some(grad) = &grads[which] else {
+                assert!(*part == "background" && scene.background.is_none());
+                continue;
+            };
+            assert_close(
+                &format!("{name}: {part}, {sums:?}"),
+                &download(&client, grad),
+                &expected[which],
+                limit,
+            );
+        }
     }
 }
 
@@ -323,8 +327,9 @@ fn only_the_wanted_gradients_and_the_same_bits_every_time() {
     let scene = Scene::new(1, 60, 40, 40, 3, [0.1, 0.9], 40);
     let inputs = scene.inputs(&client);
     let weights = uniform(&mut rng(41), 40 * 40 * 4, -1.0, 1.0);
-    let run = |wanted| {
-        let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
+    let run = |sums, wanted| {
+        let settings = RasterizeSettings { sums, ..SETTINGS };
+        let (output, state) = rasterize(&client, &inputs, &scene.frames, &settings).unwrap();
         let grad = upload(&client, &weights);
         let grads = rasterize_vjp(
             &client,
@@ -332,7 +337,7 @@ fn only_the_wanted_gradients_and_the_same_bits_every_time() {
             &state,
             &grad,
             &scene.frames,
-            &SETTINGS,
+            &settings,
             wanted,
         );
         (
@@ -340,23 +345,75 @@ fn only_the_wanted_gradients_and_the_same_bits_every_time() {
             grads.map(|g| g.map(|g| download(&client, &g))),
         )
     };
-    let first = run([true; 4]);
+    let first = run(Sums::Ordered, [true; 4]);
     for _ in 0..3 {
-        assert_eq!(run([true; 4]), first);
+        assert_eq!(run(Sums::Ordered, [true; 4]), first);
     }
-    for wanted in [
-        [true, false, false, false],
-        [false, true, false, false],
-        [false, false, true, true],
-        [false; 4],
-    ] {
-        let (_, some) = run(wanted);
-        for i in 0..4 {
-            assert_eq!(some[i].is_some(), wanted[i]);
-            if let (Some(some), Some(all)) = (&some[i], &first.1[i]) {
-                assert_close("wanted alone", some, &wide(all), 1e-6);
+    for sums in ALL_SUMS {
+        for wanted in [
+            [true, false, false, false],
+            [false, true, false, false],
+            [false, false, true, true],
+            [false; 4],
+        ] {
+            let (_, some) = run(sums, wanted);
+            for i in 0..4 {
+                assert_eq!(some[i].is_some(), wanted[i]);
+                if let (Some(some), Some(all)) = (&some[i], &first.1[i]) {
+                    assert_close("wanted alone", some, &wide(all), 1e-6);
+                }
             }
         }
+    }
+}
+
+#[test]
+fn sums_of_thousands_of_tiles_lose_nothing() {
+    let Some(client) = client() else { return };
+    // Each of three splats covers all of 4,096 tiles, whose units all add to the same few floats.
+    let side = 1024;
+    let mut scene = Scene::new(1, 3, side, side, 2, [0.3, 0.5], 45);
+    for (i, row) in scene.packed.chunks_mut(9).enumerate() {
+        let middle = side as f32 / 2.0;
+        row.copy_from_slice(&[
+            middle,
+            middle,
+            1.0 + i as f32,
+            1e-4,
+            0.0,
+            1e-4,
+            1.0,
+            4e4,
+            4e4,
+        ]);
+    }
+    let inputs = scene.inputs(&client);
+    // Of one sign: nothing cancels, and a tile that is missing is 1 of 4,096.
+    let weights = uniform(&mut rng(46), (side * side * 3) as usize, 0.5, 1.0);
+    let grad = upload(&client, &weights);
+    let [ordered, atomic, exchange] = ALL_SUMS.map(|sums| {
+        let settings = RasterizeSettings { sums, ..SETTINGS };
+        let (_, state) = rasterize(&client, &inputs, &scene.frames, &settings).unwrap();
+        assert_eq!(state.lists.instances, 3 * 64 * 64);
+        assert_eq!(state.lists.slots.is_some(), sums == Sums::Ordered);
+        let [packed, colors, ..] = rasterize_vjp(
+            &client,
+            &inputs,
+            &state,
+            &grad,
+            &scene.frames,
+            &settings,
+            [true; 4],
+        );
+        [packed, colors].map(|grad| download(&client, &grad.unwrap()))
+    });
+    let [packed, colors] = ordered;
+    for (name, [other_packed, other_colors]) in [("atomic", atomic), ("exchange", exchange)] {
+        for (a, b) in other_colors.iter().zip(&colors) {
+            let error = (a - b).abs() / b.abs();
+            assert!(error <= 5e-5, "{name}: {a}, in order {b}");
+        }
+        assert_close(name, &other_packed, &wide(&packed), 1e-5);
     }
 }
 

@@ -8,17 +8,23 @@ use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::Buffer;
 use splat_kernels::intersect::{Frames, IntersectError, MAX_INSTANCES};
 use splat_kernels::rasterize::{
-    RasterizeInputs, RasterizeSettings, RasterizeState, count_evaluations, rasterize, rasterize_vjp,
+    RasterizeInputs, RasterizeSettings, RasterizeState, Sums, count_evaluations, rasterize,
+    rasterize_vjp,
 };
 
 use super::{buffer, prepare, tensor};
 use crate::OpError;
 use crate::settings::RasterizeArgs;
 
-fn settings(args: &RasterizeArgs) -> RasterizeSettings {
+fn settings(settings: &crate::RasterizeSettings) -> RasterizeSettings {
     RasterizeSettings {
-        alpha_max: args.settings.alpha_max as f32,
-        transmittance_min: args.settings.transmittance_min as f32,
+        alpha_max: settings.alpha_max as f32,
+        transmittance_min: settings.transmittance_min as f32,
+        sums: if settings.deterministic {
+            Sums::Ordered
+        } else {
+            Sums::Atomic
+        },
     }
 }
 
@@ -102,7 +108,12 @@ pub(super) fn forward(
         frames.width as usize,
         inputs.channels + 1,
     ]);
-    match rasterize(&prepared.packed.client, &inputs, &frames, &settings(args)) {
+    match rasterize(
+        &prepared.packed.client,
+        &inputs,
+        &frames,
+        &settings(&args.settings),
+    ) {
         Ok((output, state)) => (tensor(&prepared.packed, output, shape), Some(state)),
         Err(error) => {
             args.errors.report(op_error(error));
@@ -139,7 +150,7 @@ pub(super) fn backward(
         state,
         &buffer(&grad_output),
         &frames(&prepared.colors, args),
-        &settings(args),
+        &settings(&args.settings),
         wanted,
     );
     let like = |grad: Option<Buffer>, input: &CubeTensor| {
@@ -186,12 +197,9 @@ pub(crate) fn work(
         height: size.height,
         alpha_min: settings.alpha_min as f32,
     };
-    let thresholds = RasterizeSettings {
-        alpha_max: settings.alpha_max as f32,
-        transmittance_min: settings.transmittance_min as f32,
-    };
-    let (_, state) = rasterize(client, &inputs, &frames, &thresholds).map_err(op_error)?;
-    let count = count_evaluations(client, &inputs, &state, &frames, &thresholds);
+    let settings = self::settings(settings);
+    let (_, state) = rasterize(client, &inputs, &frames, &settings).map_err(op_error)?;
+    let count = count_evaluations(client, &inputs, &state, &frames, &settings);
     let count = count.map_err(|what| op_error(IntersectError::Device(what)))?;
     Ok(crate::RasterizeWork {
         instances: state.lists.instances as u64,

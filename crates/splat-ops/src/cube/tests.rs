@@ -78,7 +78,7 @@ impl Scene {
     }
 
     /// The blurred image and the gradients of every input, named.
-    fn run(&self, device: &Device) -> Vec<(&'static str, Vec<f32>)> {
+    fn run(&self, device: &Device, deterministic: bool) -> Vec<(&'static str, Vec<f32>)> {
         fn tensor<const D: usize>(scene: &Scene, which: usize, device: &Device) -> Tensor<D> {
             let (_, shape, values) = &scene.values[which];
             Tensor::from_data(TensorData::new(values.clone(), shape.clone()), device).require_grad()
@@ -114,7 +114,10 @@ impl Scene {
             colors,
             opacities.clone(),
             Some(background.clone()),
-            &RasterizeSettings::default(),
+            &RasterizeSettings {
+                deterministic,
+                ..RasterizeSettings::default()
+            },
         )
         .unwrap();
         let image = gaussian_blur(rendered.packed(), &[0.1, 0.2, 0.4, 0.2, 0.1]).unwrap();
@@ -166,14 +169,18 @@ fn kernels_agree_with_the_native_path_in_images_and_all_gradients() {
         height: 50,
     };
     let scene = Scene::new(400, size, 2, 0.15);
-    let native = scene.run(&Device::flex());
-    let kernels = scene.run(&Device::wgpu(DeviceKind::DefaultDevice));
-    for ((name, kernels), (_, native)) in kernels.iter().zip(&native) {
-        let error = relative_l2(kernels, native);
-        println!("{name}: relative L2 {error:.1e}");
-        // Both are f32: within the 1e-4 that each keeps to float64.
-        assert!(error <= 1e-4, "{name}: relative L2 {error:e}");
+    let native = scene.run(&Device::flex(), true);
+    for deterministic in [true, false] {
+        let kernels = scene.run(&Device::wgpu(DeviceKind::DefaultDevice), deterministic);
+        for ((name, kernels), (_, native)) in kernels.iter().zip(&native) {
+            let error = relative_l2(kernels, native);
+            println!("{name}, deterministic: {deterministic}: relative L2 {error:.1e}");
+            // Both are f32: within the 1e-4 that each keeps to float64.
+            assert!(error <= 1e-4, "{name}: relative L2 {error:e}");
+        }
     }
+    // The native path knows one way only.
+    assert_eq!(scene.run(&Device::flex(), false), native);
 }
 
 /// S, and the gradients of both images for random weights.
@@ -394,7 +401,7 @@ fn time_of_a_step_at_270_by_480() {
     ] {
         for round in 0..4 {
             let start = std::time::Instant::now();
-            scene.run(&device);
+            scene.run(&device, true);
             println!("{name}, round {round}: {:?}", start.elapsed());
         }
     }

@@ -147,6 +147,7 @@ impl Reader<'_> {
                 alpha_min,
                 alpha_max: self.number("alpha_max", rasterize.alpha_max)?,
                 transmittance_min: self.number("transmittance_min", rasterize.transmittance_min)?,
+                ..rasterize
             },
             inputs: inputs("")?,
             upstream,

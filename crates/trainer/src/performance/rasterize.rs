@@ -8,6 +8,7 @@ use burn::tensor::Device;
 use serde::Serialize;
 use splat_model::files::SplatData;
 use splat_model::{Gaussians, RenderSettings, render};
+use splat_ops::RasterizeSettings;
 use splat_ops::cpu::InstructionSet;
 use splat_ops::device::describe;
 
@@ -96,6 +97,11 @@ pub struct RasterizeRow {
     pub forward: Rate,
     /// Its gradient.
     pub backward: Rate,
+    /// Its gradient again, summed as it comes; of a CubeCL device only.
+    pub backward_unordered: Option<Rate>,
+    /// What the order costs: the time of `backward` by that of `backward_unordered`, one after the other on each view and
+    /// summed over the views of a pass.
+    pub cost_of_order: Option<Spread>,
     /// What so many threads of the CPU reach side by side without lists, spans and memory; absent where a device rendered.
     pub possible: Option<Arithmetic>,
     /// Milliseconds per view of projection, colours and rasteriser together, and of their gradients; of a CubeCL device
@@ -178,6 +184,12 @@ pub fn measure(
             lists: apart.then(|| Spread::of(times(|pass| pass.lists))),
             forward: Rate::new(times(|pass| pass.forward), &work, threads),
             backward: Rate::new(times(|pass| pass.backward), &work, threads),
+            backward_unordered: facts
+                .is_some()
+                .then(|| Rate::new(times(|pass| pass.unordered), &work, threads)),
+            cost_of_order: facts
+                .is_some()
+                .then(|| Spread::of(passes.iter().map(Pass::cost_of_order).collect())),
             possible,
             render_forward_milliseconds: facts
                 .is_some()
@@ -202,6 +214,8 @@ struct Pass {
     lists: Duration,
     forward: Duration,
     backward: Duration,
+    /// `backward`, summed as it comes.
+    unordered: Duration,
     render_forward: Duration,
     render_backward: Duration,
 }
@@ -217,10 +231,22 @@ impl Pass {
             }
         }
     }
+
+    /// Of the same views, summed as it comes.
+    fn add_unordered(&mut self, stages: &[Stage]) {
+        let gradients = stages
+            .iter()
+            .filter(|stage| stage.name == "rasterize gradient");
+        self.unordered += gradients.map(|stage| stage.own).sum::<Duration>();
+    }
+
+    fn cost_of_order(&self) -> f64 {
+        self.backward.as_secs_f64() / self.unordered.as_secs_f64()
+    }
 }
 
-/// Renders the views and goes back through them, again and again; a CubeCL device twice, waited for by stages and as a
-/// whole.
+/// Renders the views and goes back through them, again and again; a CubeCL device three times: waited for by stages, with
+/// sums in order and without, and as a whole.
 fn passes(
     data: &SplatData,
     views: &[&View],
@@ -229,6 +255,13 @@ fn passes(
     seconds: f64,
 ) -> Result<Vec<Pass>, PerformanceError> {
     let waited_for = describe(device).is_some().then(|| device.clone());
+    let unordered = waited_for.as_ref().map(|_| RenderSettings {
+        rasterize: RasterizeSettings {
+            deterministic: false,
+            ..settings.rasterize
+        },
+        ..settings.clone()
+    });
     let device = device.clone().autodiff();
     let gaussians = Gaussians::from_data(data, &device);
     let inputs: Vec<_> = views
@@ -243,11 +276,22 @@ fn passes(
         let start = Instant::now();
         for number in 0..WARM_UP + PASSES {
             let mut pass = Pass::default();
-            for (cameras, photo) in &inputs {
-                let rendered = render(&gaussians, cameras, settings)?;
-                let difference = rendered.image() - photo.clone();
-                difference.square().mean().backward();
-                pass.add(&recording.take());
+            for (at, (cameras, photo)) in inputs.iter().enumerate() {
+                let stages = |settings: &RenderSettings| -> Result<_, PerformanceError> {
+                    let rendered = render(&gaussians, cameras, settings)?;
+                    let difference = rendered.image() - photo.clone();
+                    difference.square().mean().backward();
+                    Ok(recording.take())
+                };
+                // What comes first on one view comes second on the next.
+                let first = unordered.as_ref().filter(|_| (number + at) % 2 == 0);
+                if let Some(settings) = first {
+                    pass.add_unordered(&stages(settings)?);
+                }
+                pass.add(&stages(settings)?);
+                if let (Some(settings), None) = (&unordered, first) {
+                    pass.add_unordered(&stages(settings)?);
+                }
             }
             if number >= WARM_UP {
                 passes.push(pass);
@@ -307,7 +351,13 @@ impl RasterizeReport {
         )?;
         writeln!(text, "|---|{}", "--:|".repeat(5))?;
         for row in &self.rows {
-            for (direction, rate) in [("forward", row.forward), ("backward", row.backward)] {
+            let directions = [
+                ("forward", Some(row.forward)),
+                ("backward, summed in order", Some(row.backward)),
+                ("backward, summed as it comes", row.backward_unordered),
+            ];
+            for (direction, rate) in directions {
+                let Some(rate) = rate else { continue };
                 let Spread { median, min, max } = rate.milliseconds;
                 writeln!(
                     text,
@@ -330,6 +380,16 @@ impl RasterizeReport {
                         "| {direction} | {median:.2} | {min:.2} | {max:.2} | | |"
                     )?;
                 }
+            }
+        }
+        for row in &self.rows {
+            if let Some(Spread { median, min, max }) = row.cost_of_order {
+                writeln!(
+                    text,
+                    "\nSums in order take {median:.3} times as long as sums that are added as they come ({min:.3} to {max:.3} over \
+                     {} passes), view by view one after the other.",
+                    row.passes
+                )?;
             }
         }
         Ok(())

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 use splat_model::density::AdaptiveSettings;
-use splat_model::ops::AdamRows;
+use splat_model::ops::{AdamRows, RasterizeSettings};
 use splat_model::{InitSettings, LearningRates, RenderSettings};
 
 /// More would leave no photo anything to see.
@@ -35,6 +35,9 @@ pub struct TrainConfig {
     /// Adam steps only the Gaussians that the view saw, see [`AdamRows::Seen`]. Default false: on a capture where each
     /// view sees most of them it was no faster, and 0.06 dB worse (50 photos, 2,000 steps, mean of three seeds).
     pub seen_rows_only: bool,
+    /// Whether a run repeats bit for bit on a CubeCL device; false saves memory there, see
+    /// [`RasterizeSettings::deterministic`]. On the CPU it always does. Default true.
+    pub deterministic: bool,
     /// The first Gaussians.
     pub init: InitSettings,
     /// Learning rates.
@@ -57,6 +60,7 @@ impl Default for TrainConfig {
             background: None,
             ssim_weight: 0.2,
             seen_rows_only: false,
+            deterministic: true,
             init: InitSettings::default(),
             rates: LearningRates::default(),
             density: AdaptiveSettings::default(),
@@ -71,6 +75,10 @@ impl TrainConfig {
             sh_degree,
             antialias: self.antialias,
             background: self.background,
+            rasterize: RasterizeSettings {
+                deterministic: self.deterministic,
+                ..RasterizeSettings::default()
+            },
             ..RenderSettings::default()
         }
     }
