@@ -340,3 +340,58 @@ fn total<T: Real>(parts: &Parts<T>) -> T {
     }
     sums[0]
 }
+
+#[cfg(test)]
+mod tests {
+    use burn::tensor::{Device, Tensor, TensorData};
+
+    use super::*;
+    use crate::{ImageSize, Projected, RasterizeSettings, rasterize};
+
+    /// Faint splats as wide as can be, the light of whose pixels ends in the second batch: each splat's weight is alpha times
+    /// what the ones before it leave, and nothing from there on.
+    #[test]
+    fn light_that_ends_behind_the_first_batch_ends_there_in_the_gradient_too() {
+        let (count, alpha, size) = (
+            3 * BATCH,
+            0.05f32,
+            ImageSize {
+                width: 5,
+                height: 3,
+            },
+        );
+        let device = Device::flex().autodiff();
+        let rows = (0..count).flat_map(|i| {
+            let depth = 1.0 + i as f32;
+            [2.5, 1.5, depth, 1e-4, 0.0, 1e-4, 1.0, 1e5, 1e5]
+        });
+        let packed = TensorData::new(rows.collect::<Vec<f32>>(), [1, count, 9]);
+        let projected = Projected::from_packed(Tensor::from_data(packed, &device), size).unwrap();
+        let colors = Tensor::<2>::ones([count, 1], &device).require_grad();
+        let opacities = Tensor::<1>::full([count], alpha, &device);
+        let settings = RasterizeSettings::default();
+        let rendered = rasterize(&projected, colors.clone(), opacities, None, &settings).unwrap();
+        let grads = rendered.image().sum().backward();
+        let weights = colors.grad(&grads).unwrap().into_data();
+        let weights = weights.try_into_vec::<f32>().unwrap();
+
+        let (mut left, mut last) = (1.0f64, 0);
+        for (place, weight) in weights.iter().enumerate() {
+            let after = left * f64::from(1.0 - alpha);
+            let stopped = after < f64::from(settings.transmittance_min as f32);
+            let expected = if stopped { 0.0 } else { 15.0 * (left - after) };
+            let error = (f64::from(*weight) - expected).abs();
+            assert!(
+                error <= 1e-4 * expected,
+                "splat {place}: {weight}, not {expected}"
+            );
+            if !stopped {
+                (left, last) = (after, place);
+            }
+        }
+        assert!(
+            (BATCH..2 * BATCH).contains(&last),
+            "the last splat is {last}"
+        );
+    }
+}
