@@ -59,8 +59,8 @@ fn add_screen_statistics(
     }
 }
 
-/// Gradients of packed splats and these themselves, both `[C, N, 9]`, and sums of lengths and of views, both `[N]`, to these sums
-/// with the lengths of `half * gradient` and the views added: in their own memory, where nothing else holds it.
+/// Gradients of packed splats and these themselves, both `[C, N, 9]`, and sums of lengths and of views, both `[N]`, to
+/// these sums with the lengths of `half * gradient` and the views added: in their own memory, where nothing else holds it.
 pub fn screen_statistics(
     client: &Client,
     [gradient, packed]: [&Buffer; 2],

@@ -299,13 +299,12 @@ vectorized! {
         ty: usize,
         slab: Slab<T>,
     ) -> Reached {
-        let channels = view.channels;
-        let mut tile = BlendTile::new(channels);
+        let mut tile = BlendTile::new(view.channels);
         let mut slab = slab;
         let mut reached = Reached::with_capacity(view.lists.row_of_tiles(ty, view.grid).len());
         for tx in 0..view.grid.columns {
             let list = view.lists.tile(ty * view.grid.columns + tx);
-            tile.blend::<FMA>(view, list, [tx, ty], channels, &mut reached, &mut ());
+            tile.blend::<FMA>(view, list, [tx, ty], &mut reached, &mut ());
             tile.store(view, [tx, ty], &mut slab);
         }
         reached
@@ -387,7 +386,7 @@ vectorized! {
             let (of_tile, rest) = reached.split_at(list.len());
             (partials, reached) = (later, rest);
             tile.load(view, upstream, [tx, ty], &mut background);
-            tile.walk::<FMA>(view, list, [tx, ty], channels, of_tile, sums);
+            tile.walk::<FMA>(view, list, [tx, ty], of_tile, sums);
         }
         background
     }

@@ -17,7 +17,7 @@ pub enum PrecisionChoice {
     /// Single precision
     #[default]
     Exact,
-    /// The higher degrees in half precision, on devices that read it: less memory, colours to about 2e-4
+    /// The higher degrees in half precision, on devices that read it: less memory; docs/GPU.md has the error
     Half,
 }
 

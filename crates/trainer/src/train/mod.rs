@@ -261,8 +261,7 @@ impl TrainerBuilder {
     }
 }
 
-/// Beyond so many Gaussians growth is not worth its time: one for every two pixels of a photo, or for every hundred of all that
-/// are trained on (300 values for up to 59 parameters), whichever is more. docs/TRAINING.md has what more would give.
+/// Beyond so many Gaussians growth is not worth its time, see [`TrainConfig::density`].
 fn worthwhile_gaussians(capture: &Capture) -> usize {
     let pixels = |view: &usize| {
         let view = &capture.views[*view];
@@ -372,7 +371,8 @@ impl Trainer {
     /// step whose loss is not is a warning, and an error only when many come in a row.
     ///
     /// # Errors
-    /// When the loss is not finite for 100 steps in a row, or for the whole of a shorter run, an op refuses what it is given, or a checkpoint cannot be kept.
+    /// When the loss is not finite for 100 steps in a row, or for the whole of a shorter run, an op refuses what it is
+    /// given, or a checkpoint cannot be kept.
     pub fn run(mut self) -> Result<Trained, TrainError> {
         if self.state.step == 0 {
             let found = warnings::start::inspect(&self.capture, &self.gaussians, &self.config);

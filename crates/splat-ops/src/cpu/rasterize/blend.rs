@@ -49,12 +49,11 @@ impl<T: Real> BlendTile<T> {
         view: &View<T>,
         list: &[u32],
         tile: [usize; 2],
-        channels: usize,
         reached: &mut Reached,
         tally: &mut impl Tally,
     ) {
         let thresholds = Thresholds::<T>::new(view.args);
-        let corner = corner(tile);
+        let (corner, channels) = (corner(tile), view.channels);
         let mut open = self.begin(view.inside(tile), &thresholds);
         let end = reached.len() + list.len();
 

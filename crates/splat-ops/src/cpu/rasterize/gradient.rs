@@ -83,8 +83,8 @@ impl<T: Real> GradientTile<T> {
         }
     }
 
-    /// Reads the tile's pixels, and adds its share of the background's gradient, `sum of T_final grad`, if there is one. Pixels outside
-    /// of the image have blended nothing.
+    /// Reads the tile's pixels, and adds its share of the background's gradient, `sum of T_final grad`, if there is one.
+    /// Pixels outside of the image have blended nothing.
     #[inline(always)]
     pub(super) fn load(
         &mut self,
@@ -143,10 +143,10 @@ impl<T: Real> GradientTile<T> {
         view: &View<T>,
         list: &[u32],
         tile: [usize; 2],
-        channels: usize,
         reached: &[u16],
         partials: &mut [T],
     ) {
+        let channels = view.channels;
         let width = MOMENTS + channels;
         let thresholds = Thresholds::<T>::new(view.args);
         let corner = corner(tile);

@@ -73,7 +73,7 @@ fn of_camera(camera: &Camera<f32>, args: &RasterizeArgs) -> Result<RasterizeWork
         let list = view.lists.tile(tile);
         let tile = [tile % view.grid.columns, tile / view.grid.columns];
         // Without FMA a few pairs at a threshold may fall to its other side; for a count that is nothing.
-        BlendTile::new(d).blend::<false>(&view, list, tile, d, &mut Vec::new(), &mut work);
+        BlendTile::new(d).blend::<false>(&view, list, tile, &mut Vec::new(), &mut work);
         work
     });
     let mut work = blended.reduce(RasterizeWork::default, |mut sum, tile| {
