@@ -154,13 +154,6 @@ impl<'a, T: Real> View<'a, T> {
         }
     }
 
-    /// Some of the colours of a splat.
-    #[inline(always)]
-    fn colors<const GROUP: usize>(&self, index: u32, first: usize) -> [T; GROUP] {
-        let colors = &self.colors[index as usize * self.channels + first..][..GROUP];
-        core::array::from_fn(|i| colors[i])
-    }
-
     /// Pixels in one row of tiles (the last row of tiles may have fewer).
     fn slab(&self) -> usize {
         TILE * self.width

@@ -1,5 +1,7 @@
 //! Splats of a tile's list that are worked on together, and which of them reach each block of the tile.
 
+use core::ops::Range;
+
 use super::super::real::Real;
 use super::super::simd::prefetch;
 use super::View;
@@ -12,20 +14,23 @@ pub(super) const BATCH: usize = 128;
 /// backward. A bit per block, a number per (tile, splat) pair; none from the batch on that found every pixel stopped.
 pub(super) type Reached = Vec<u16>;
 
+/// So many channels are worked on at once.
+pub(super) const GROUP: usize = 4;
+
 /// Calls a method for all channels, a few at a time and of a number that the compiler knows, which unrolls its loops:
-/// `method::<FMA, GROUP>(first, ...)`.
+/// `method::<FMA, COUNT>(first, ...)`.
 macro_rules! by_groups {
-    ($this:ident.$method:ident::<$fma:ident>($channels:ident $(, $argument:expr)*)) => {{
+    ($this:ident.$method:ident$(::<$fma:ident>)?($channels:ident $(, $argument:expr)*)) => {{
         let mut first = 0;
         while first < $channels {
-            let group = 4.min($channels - first);
-            match group {
-                1 => $this.$method::<$fma, 1>(first $(, $argument)*),
-                2 => $this.$method::<$fma, 2>(first $(, $argument)*),
-                3 => $this.$method::<$fma, 3>(first $(, $argument)*),
-                _ => $this.$method::<$fma, 4>(first $(, $argument)*),
+            let count = GROUP.min($channels - first);
+            match count {
+                1 => $this.$method::<$($fma,)? 1>(first $(, $argument)*),
+                2 => $this.$method::<$($fma,)? 2>(first $(, $argument)*),
+                3 => $this.$method::<$($fma,)? 3>(first $(, $argument)*),
+                _ => $this.$method::<$($fma,)? GROUP>(first $(, $argument)*),
             }
-            first += group;
+            first += count;
         }
     }};
 }
@@ -33,20 +38,24 @@ macro_rules! by_groups {
 pub(super) use by_groups;
 
 /// The splats, side by side.
+// Arrays of a fixed size, so that no place needs a check.
 pub(super) struct Batch<T> {
-    splats: Vec<Splat<T>>,
+    splats: Box<[Splat<T>; BATCH]>,
+    /// By group of channels.
+    colors: Vec<[[T; GROUP]; BATCH]>,
     pub(super) places: Places,
 }
 
 impl<T: Real> Batch<T> {
-    pub(super) fn new() -> Self {
+    pub(super) fn new(channels: usize) -> Self {
         Self {
-            splats: vec![Splat::default(); BATCH],
+            splats: Box::new([Splat::default(); BATCH]),
+            colors: vec![[[T::ZERO; GROUP]; BATCH]; channels.div_ceil(GROUP)],
             places: Places::new(),
         }
     }
 
-    /// Fetches the splats of a part of a list, and returns them.
+    /// Fetches the splats of a part of a list with their colours, and returns them.
     #[inline(always)]
     pub(super) fn gather(&mut self, view: &View<T>, list: &[u32]) -> &[Splat<T>] {
         for (place, (splat, index)) in self.splats.iter_mut().zip(list).enumerate() {
@@ -55,15 +64,42 @@ impl<T: Real> Batch<T> {
             prefetch(view.colors, next.map(|index| index * view.channels));
             *splat = view.splats[*index as usize];
         }
+        let channels = view.channels;
+        by_groups!(self.gather_colors(channels, view, list));
         &self.splats[..list.len()]
     }
 
-    /// Those that reach a block, in order.
     #[inline(always)]
-    pub(super) fn reaching(&self, block: usize) -> impl Iterator<Item = Splat<T>> {
-        let splats = &self.splats;
+    fn gather_colors<const COUNT: usize>(&mut self, first: usize, view: &View<T>, list: &[u32]) {
+        for (batched, index) in self.colors[first / GROUP].iter_mut().zip(list) {
+            let colors = &view.colors[*index as usize * view.channels + first..][..COUNT];
+            batched[..COUNT].copy_from_slice(colors);
+        }
+    }
+
+    /// Some of those that reach a block, in order.
+    // Copies: behind references they might alias what is written, which bars SIMD.
+    #[inline(always)]
+    pub(super) fn reaching(
+        &self,
+        block: usize,
+        range: Range<usize>,
+    ) -> impl DoubleEndedIterator<Item = Splat<T>> + ExactSizeIterator {
+        let places = self.places.of(block)[range].iter();
+        places.map(|place| self.splat(*place))
+    }
+
+    #[inline(always)]
+    pub(super) fn splat(&self, place: u8) -> Splat<T> {
+        self.splats[usize::from(place) % BATCH]
+    }
+
+    /// Some channels of their colours, from a first one on.
+    #[inline(always)]
+    pub(super) fn colors(&self, block: usize, first: usize) -> impl Iterator<Item = [T; GROUP]> {
+        let colors = &self.colors[first / GROUP];
         let places = self.places.of(block).iter();
-        places.map(|place| splats[usize::from(*place)])
+        places.map(|place| colors[usize::from(*place) % BATCH])
     }
 }
 

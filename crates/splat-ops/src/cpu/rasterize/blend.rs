@@ -1,6 +1,6 @@
 //! Blends the splats of a tile, front to back.
 //!
-//! Block by block, and each block in three passes over the splats that reach it: raw alphas, which depend on nothing
+//! Block by block, and each block in three passes over the splats that reach it: falloffs, which depend on nothing
 //! else; weights, one splat after the other; colours, a product of matrices. Each is a short loop, of which the processor
 //! has several turns under way at once. All in one, it would wait for every exponential.
 
@@ -8,9 +8,10 @@ use core::ops::Range;
 
 use super::super::intersect::TILE;
 use super::super::real::Real;
-use super::batch::{BATCH, Batch, Reached, by_groups};
+use super::batch::{BATCH, Batch, GROUP, Reached, by_groups};
 use super::splat::{
-    Aligned, BLOCKS, LANES, Lanes, Thresholds, any, centres, corner, in_blocks, square,
+    Aligned, BLOCKS, Centres, HALF, LANES, Lanes, SIDE, Thresholds, any_less, corner, in_blocks,
+    squares,
 };
 use super::work::Tally;
 use super::{Slab, View};
@@ -25,8 +26,9 @@ pub(super) struct BlendTile<T> {
     stop: [Aligned<Lanes<i32>>; BLOCKS],
     /// D of each block.
     colors: Vec<Aligned<Lanes<T>>>,
+    centres: [Centres<T>; BLOCKS],
     batch: Batch<T>,
-    /// Of every splat that reaches the block at hand: raw alphas, then weights.
+    /// Of every splat that reaches the block at hand: `|z|^2`, then falloffs, then weights.
     weights: [Aligned<Lanes<T>>; BATCH],
 }
 
@@ -37,7 +39,8 @@ impl<T: Real> BlendTile<T> {
             gate: [Aligned([T::of(f64::INFINITY); LANES]); BLOCKS],
             stop: [Aligned([i32::MAX; LANES]); BLOCKS],
             colors: vec![Aligned([T::ZERO; LANES]); channels * BLOCKS],
-            batch: Batch::new(),
+            centres: Centres::of_blocks(),
+            batch: Batch::new(channels),
             weights: [Aligned([T::ZERO; LANES]); BATCH],
         }
     }
@@ -72,7 +75,7 @@ impl<T: Real> BlendTile<T> {
                 self.evaluate::<FMA>(block, corner, &thresholds, tally);
                 let place = (number * BATCH) as i32;
                 let (count, is_open) = self.weigh::<FMA>(block, place, &thresholds, tally);
-                by_groups!(self.add_colors::<FMA>(channels, view, part, block, count));
+                by_groups!(self.add_colors::<FMA>(channels, channels, block, count));
                 if !is_open {
                     open &= !(1 << block);
                 }
@@ -102,7 +105,7 @@ impl<T: Real> BlendTile<T> {
         open
     }
 
-    /// Raw alphas of the splats that reach a block.
+    /// Falloffs of the splats that reach a block.
     #[inline(always)]
     fn evaluate<const FMA: bool>(
         &mut self,
@@ -111,22 +114,27 @@ impl<T: Real> BlendTile<T> {
         thresholds: &Thresholds<T>,
         tally: &mut impl Tally,
     ) {
-        let [xs, ys] = centres(corner, block);
-        for (weights, splat) in self.weights.iter_mut().zip(self.batch.reaching(block)) {
-            for i in 0..LANES {
-                weights.0[i] = square::<T, FMA>(splat.z::<FMA>(xs[i], ys[i]));
+        let Centres { x, y } = self.centres[block].beyond(corner);
+        let count = self.batch.places.of(block).len();
+        let weights = &mut self.weights[..count];
+        for (weights, splat) in weights.iter_mut().zip(self.batch.reaching(block, 0..count)) {
+            for i in 0..HALF {
+                let (z1, z2) = splat.z::<FMA>(x[i], [y[0][i], y[1][i]]);
+                [weights.0[i], weights.0[HALF + i]] = squares::<T, FMA>(z1, z2);
             }
         }
-        // By itself, so that all that an exponential needs stays in registers.
-        for (weights, splat) in self.weights.iter_mut().zip(self.batch.reaching(block)) {
+        // By themselves, so that all that an exponential needs stays in registers.
+        for (weights, splat) in weights.iter_mut().zip(self.batch.reaching(block, 0..count)) {
             for i in 0..LANES {
-                weights.0[i] = splat.raw::<FMA>(weights.0[i]);
-                tally.tested(thresholds.seen(weights.0[i]));
+                weights.0[i] = T::exp2_neg::<FMA>(weights.0[i]);
+            }
+            for raw in splat.raw(&weights.0) {
+                tally.tested(thresholds.seen(raw));
             }
         }
     }
 
-    /// Turns raw alphas into weights, the share of a pixel's light that each splat sends. The list's batch begins at a
+    /// Turns falloffs into weights, the share of a pixel's light that each splat sends. The list's batch begins at a
     /// `place`. Returns how many splats there are until all pixels of the block have stopped, and whether any has not.
     #[inline(always)]
     fn weigh<const FMA: bool>(
@@ -165,13 +173,15 @@ impl<T: Real> BlendTile<T> {
         let gate = self.gate[block].0;
         let mut before = self.transmittance[block].0;
         let mut done = 0;
-        for weights in &mut self.weights[splats] {
-            let (shares, left) = blend::<T, FMA>(&weights.0, &gate, &before, thresholds);
-            if any(&left, |left| thresholds.stops(left)) {
+        let reaching = self.batch.reaching(block, splats.clone());
+        for (weights, splat) in self.weights[splats].iter_mut().zip(reaching) {
+            let raw = splat.raw(&weights.0);
+            let (shares, left) = blend::<T, FMA>(&raw, &gate, &before, thresholds);
+            if thresholds.any_stops(&left) {
                 break;
             }
             for i in 0..LANES {
-                tally.blended(weights.0[i] >= gate[i]);
+                tally.blended(raw[i] >= gate[i]);
                 weights.0[i] = shares[i] * before[i];
                 before[i] = left[i];
             }
@@ -192,7 +202,9 @@ impl<T: Real> BlendTile<T> {
     ) -> bool {
         let (mut gate, mut stop) = (self.gate[block].0, self.stop[block].0);
         let before = self.transmittance[block].0;
-        let (_, left) = blend::<T, FMA>(&self.weights[number].0, &gate, &before, thresholds);
+        let splat = self.batch.splat(self.batch.places.of(block)[number]);
+        let raw = splat.raw(&self.weights[number].0);
+        let (_, left) = blend::<T, FMA>(&raw, &gate, &before, thresholds);
         let closed = T::of(f64::INFINITY);
         for i in 0..LANES {
             let stops = thresholds.stops(left[i]);
@@ -200,24 +212,22 @@ impl<T: Real> BlendTile<T> {
             stop[i] = if stops { place } else { stop[i] };
         }
         (self.gate[block].0, self.stop[block].0) = (gate, stop);
-        any(&gate, |gate| gate < closed)
+        any_less(&gate, closed)
     }
 
     /// Adds the colours of the first splats that reach a block, times their weights.
     #[inline(always)]
-    fn add_colors<const FMA: bool, const GROUP: usize>(
+    fn add_colors<const FMA: bool, const COUNT: usize>(
         &mut self,
         first: usize,
-        view: &View<T>,
-        list: &[u32],
+        channels: usize,
         block: usize,
         count: usize,
     ) {
-        let planes = &mut self.colors[block * view.channels + first..][..GROUP];
-        let mut sums: [Lanes<T>; GROUP] = core::array::from_fn(|i| planes[i].0);
-        let places = self.batch.places.of(block);
-        for (weights, place) in self.weights[..count].iter().zip(places) {
-            let colors = view.colors::<GROUP>(list[usize::from(*place)], first);
+        let planes = &mut self.colors[block * channels + first..][..COUNT];
+        let mut sums: [Lanes<T>; COUNT] = core::array::from_fn(|i| planes[i].0);
+        let colors = self.batch.colors(block, first);
+        for (weights, colors) in self.weights[..count].iter().zip(colors) {
             for (sum, color) in sums.iter_mut().zip(colors) {
                 for i in 0..LANES {
                     sum[i] = T::multiply_add::<FMA>(color, weights.0[i], sum[i]);
@@ -232,36 +242,45 @@ impl<T: Real> BlendTile<T> {
     /// Writes the tile into its row of tiles, with the background behind it.
     #[inline(always)]
     pub(super) fn store(&self, view: &View<T>, [tx, ty]: [usize; 2], slab: &mut Slab<T>) {
-        // With a number of channels that the compiler knows, their loops are unrolled.
-        match view.channels {
-            3 => self.store_channels(view, [tx, ty], slab, 3),
-            channels => self.store_channels(view, [tx, ty], slab, channels),
+        let [columns, rows] = view.inside([tx, ty]);
+        for row in 0..rows {
+            for column in (0..columns).step_by(SIDE) {
+                let from = in_blocks(column, row);
+                let pixel = row * view.width + tx * TILE + column;
+                // With numbers that the compiler knows, loops are unrolled.
+                match (view.channels, columns - column) {
+                    (3, SIDE..) => self.store_row(view, from, pixel, slab, 3, SIDE),
+                    (d, width) => self.store_row(view, from, pixel, slab, d, width.min(SIDE)),
+                }
+            }
         }
     }
 
+    /// Writes some pixels of a row of a block.
     #[inline(always)]
-    fn store_channels(
+    fn store_row(
         &self,
         view: &View<T>,
-        [tx, ty]: [usize; 2],
+        [block, lane]: [usize; 2],
+        pixel: usize,
         slab: &mut Slab<T>,
         channels: usize,
+        width: usize,
     ) {
-        let [columns, rows] = view.inside([tx, ty]);
-        for row in 0..rows {
-            for column in 0..columns {
-                let [block, lane] = in_blocks(column, row);
-                let pixel = row * view.width + tx * TILE + column;
-                let left = self.transmittance[block].0[lane];
-                let out = &mut slab.image[pixel * (channels + 1)..(pixel + 1) * (channels + 1)];
-                for channel in 0..channels {
-                    let behind = view.background.map_or(T::ZERO, |b| b[channel]);
-                    out[channel] = self.colors[block * channels + channel].0[lane] + left * behind;
-                }
-                out[channels] = T::ONE - left;
-                slab.transmittance[pixel] = left;
-                slab.stop[pixel] = self.stop[block].0[lane];
+        let (left, stop) = (self.transmittance[block].0, self.stop[block].0);
+        let (pixels, lanes) = (pixel..pixel + width, lane..lane + width);
+        slab.transmittance[pixels.clone()].copy_from_slice(&left[lanes.clone()]);
+        slab.stop[pixels].copy_from_slice(&stop[lanes]);
+        let image = &mut slab.image[pixel * (channels + 1)..][..width * (channels + 1)];
+        for channel in 0..channels {
+            let behind = view.background.map_or(T::ZERO, |b| b[channel]);
+            let colors = self.colors[block * channels + channel].0;
+            for i in 0..width {
+                image[i * (channels + 1) + channel] = colors[lane + i] + left[lane + i] * behind;
             }
+        }
+        for i in 0..width {
+            image[i * (channels + 1) + channels] = T::ONE - left[lane + i];
         }
     }
 }

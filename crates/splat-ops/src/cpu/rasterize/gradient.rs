@@ -2,7 +2,7 @@
 //!
 //! ```text
 //! d alpha = T (c . grad) - behind / (1 - alpha)
-//! g = d sigma = -raw d alpha     (0 at the cap)
+//! g = d sigma = -raw d alpha = raw (behind - T' (c . grad)) / (1 - alpha)     (0 at the cap)
 //! ```
 //!
 //! Everything that a splat's shape needs is six sums over its pixels, of g times 1, z1, z2, z1^2, z1 z2 and z2^2. z is of
@@ -15,11 +15,17 @@
 //! d w21 = sum(g z1 z2) / w11
 //! ```
 
+use core::ops::Range;
+
 use super::super::intersect::TILE;
 use super::super::real::Real;
+use super::super::simd::prefetch;
 use super::View;
-use super::batch::{BATCH, Batch, by_groups};
-use super::splat::{Aligned, BLOCKS, LANES, Lanes, Thresholds, centres, corner, in_blocks, square};
+use super::batch::{BATCH, Batch, GROUP, by_groups};
+use super::splat::{
+    Aligned, BLOCKS, Centres, HALF, Half, LANES, Lanes, SIDE, Thresholds, corner, in_blocks,
+    squares,
+};
 
 /// Sums per splat before those of its D colours.
 pub(super) const MOMENTS: usize = 6;
@@ -42,23 +48,22 @@ pub(super) struct GradientTile<T> {
     stop: [Aligned<Lanes<i32>>; BLOCKS],
     /// D of each block: gradient of the image.
     grad: Vec<Aligned<Lanes<T>>>,
+    centres: [Centres<T>; BLOCKS],
     batch: Batch<T>,
     /// Of every splat that reaches the block at hand.
     pairs: Vec<Aligned<Pairs<T>>>,
     /// `MOMENTS + D` sums of each splat of the batch, each in parts that are added last.
-    sums: Vec<Aligned<Parts<T>>>,
+    sums: Vec<Aligned<Half<T>>>,
 }
-
-/// A sum over pixels, in as many parts as there are pixels in half a block.
-type Parts<T> = [T; LANES / 2];
 
 /// A splat and each pixel of a block.
 #[derive(Clone, Copy)]
 struct Pairs<T> {
-    z1: Lanes<T>,
-    z2: Lanes<T>,
-    /// Raw alpha, and then g.
-    raw: Lanes<T>,
+    /// Of the upper and of the lower half.
+    z1: Half<T>,
+    z2: [Half<T>; 2],
+    /// `|z|^2`, then the falloff, and then g.
+    falloff: Lanes<T>,
     /// c . grad, and then the splat's weight.
     toward: Lanes<T>,
 }
@@ -67,9 +72,9 @@ impl<T: Real> GradientTile<T> {
     pub(super) fn new(channels: usize) -> Self {
         let none = [T::ZERO; LANES];
         let pairs = Pairs {
-            z1: none,
-            z2: none,
-            raw: none,
+            z1: [T::ZERO; HALF],
+            z2: [[T::ZERO; HALF]; 2],
+            falloff: none,
             toward: none,
         };
         Self {
@@ -77,9 +82,10 @@ impl<T: Real> GradientTile<T> {
             behind: [Aligned(none); BLOCKS],
             stop: [Aligned([0; LANES]); BLOCKS],
             grad: vec![Aligned(none); channels * BLOCKS],
-            batch: Batch::new(),
+            centres: Centres::of_blocks(),
+            batch: Batch::new(channels),
             pairs: vec![Aligned(pairs); BATCH],
-            sums: vec![Aligned([T::ZERO; LANES / 2]); BATCH * (MOMENTS + channels)],
+            sums: vec![Aligned([T::ZERO; HALF]); BATCH * (MOMENTS + channels)],
         }
     }
 
@@ -90,48 +96,76 @@ impl<T: Real> GradientTile<T> {
         &mut self,
         view: &View<T>,
         upstream: &Upstream<T>,
-        tile: [usize; 2],
+        [tx, ty]: [usize; 2],
         background: &mut [T],
     ) {
-        // With a number of channels that the compiler knows, their loops are unrolled.
-        match view.channels {
-            3 => self.load_channels(view, upstream, tile, 3, background),
-            channels => self.load_channels(view, upstream, tile, channels, background),
+        let [columns, rows] = view.inside([tx, ty]);
+        if [columns, rows] != [TILE; 2] {
+            self.transmittance = [Aligned([T::ONE; LANES]); BLOCKS];
+            self.behind = [Aligned([T::ZERO; LANES]); BLOCKS];
+            self.stop = [Aligned([0; LANES]); BLOCKS];
+            self.grad.fill(Aligned([T::ZERO; LANES]));
+        }
+        for row in 0..rows {
+            for column in (0..columns).step_by(SIDE) {
+                let to = in_blocks(column, row);
+                let pixel = (ty * TILE + row) * view.width + tx * TILE + column;
+                // With numbers that the compiler knows, loops are unrolled.
+                match (view.channels, columns - column) {
+                    (3, SIDE..) => self.load_row(view, upstream, pixel, to, 3, SIDE, background),
+                    (d, width) => {
+                        let width = width.min(SIDE);
+                        self.load_row(view, upstream, pixel, to, d, width, background);
+                    }
+                }
+            }
         }
     }
 
+    /// Reads some pixels of a row of a block.
     #[inline(always)]
-    fn load_channels(
+    fn load_row(
         &mut self,
         view: &View<T>,
         upstream: &Upstream<T>,
-        [tx, ty]: [usize; 2],
+        pixel: usize,
+        [block, lane]: [usize; 2],
         channels: usize,
+        width: usize,
         background: &mut [T],
     ) {
-        self.transmittance = [Aligned([T::ONE; LANES]); BLOCKS];
-        self.behind = [Aligned([T::ZERO; LANES]); BLOCKS];
-        self.stop = [Aligned([0; LANES]); BLOCKS];
-        self.grad.fill(Aligned([T::ZERO; LANES]));
-        let [columns, rows] = view.inside([tx, ty]);
-        for row in 0..rows {
-            for column in 0..columns {
-                let [block, lane] = in_blocks(column, row);
-                let pixel = (ty * TILE + row) * view.width + tx * TILE + column;
-                let grad = &upstream.grad[pixel * (channels + 1)..(pixel + 1) * (channels + 1)];
-                let left = upstream.transmittance[pixel];
-                let mut behind = -grad[channels];
-                for channel in 0..channels {
-                    self.grad[block * channels + channel].0[lane] = grad[channel];
-                    if let Some(color) = view.background {
-                        behind += color[channel] * grad[channel];
-                        background[channel] += left * grad[channel];
-                    }
-                }
-                self.transmittance[block].0[lane] = left;
-                self.behind[block].0[lane] = left * behind;
-                self.stop[block].0[lane] = upstream.stop[pixel];
+        // The same rows of the next tile, which lie anywhere.
+        let next = pixel + TILE;
+        prefetch(upstream.grad, Some(next * (channels + 1)));
+        prefetch(upstream.transmittance, Some(next));
+        prefetch(upstream.stop, Some(next));
+        let pixels = pixel..pixel + width;
+        let (left, stop) = (
+            &upstream.transmittance[pixels.clone()],
+            &upstream.stop[pixels],
+        );
+        let grad = &upstream.grad[pixel * (channels + 1)..][..width * (channels + 1)];
+        let planes = &mut self.grad[block * channels..][..channels];
+        let mut behind = [T::ZERO; SIDE];
+        for i in 0..width {
+            behind[i] = -grad[i * (channels + 1) + channels];
+        }
+        for channel in 0..channels {
+            for i in 0..width {
+                planes[channel].0[lane + i] = grad[i * (channels + 1) + channel];
             }
+            if let Some(color) = view.background {
+                for i in 0..width {
+                    let grad = grad[i * (channels + 1) + channel];
+                    behind[i] += color[channel] * grad;
+                    background[channel] += left[i] * grad;
+                }
+            }
+        }
+        for i in 0..width {
+            self.transmittance[block].0[lane + i] = left[i];
+            self.behind[block].0[lane + i] = left[i] * behind[i];
+            self.stop[block].0[lane + i] = stop[i];
         }
     }
 
@@ -155,14 +189,15 @@ impl<T: Real> GradientTile<T> {
         for (number, ((list, reached), partials)) in batches.enumerate().rev() {
             self.batch.gather(view, list);
             self.batch.places.fill(reached);
-            self.sums[..list.len() * width].fill(Aligned([T::ZERO; LANES / 2]));
+            self.sums[..list.len() * width].fill(Aligned([T::ZERO; HALF]));
             let first = (number * BATCH) as i32;
             for block in 0..BLOCKS {
-                let count = self.count(block, first);
+                let [open, count] = self.counts(block, first);
                 if count > 0 {
                     self.evaluate::<FMA>(block, count, corner);
-                    by_groups!(self.look::<FMA>(channels, view, list, block, count));
-                    self.step::<FMA>(block, count, first, &thresholds);
+                    by_groups!(self.look::<FMA>(channels, channels, block, count));
+                    self.step::<FMA, true>(block, open..count, first, &thresholds);
+                    self.step::<FMA, false>(block, 0..open, first, &thresholds);
                     self.add_moments::<FMA>(block, count, width);
                     by_groups!(self.add_colors::<FMA>(channels, channels, block, count));
                 }
@@ -173,52 +208,54 @@ impl<T: Real> GradientTile<T> {
         }
     }
 
-    /// How many splats of the batch, which begins at a place of the list, reach a block before its last pixel stopped.
+    /// How many splats of the batch, which begins at a place of the list, reach a block before its first pixel stopped, and
+    /// before its last one did.
     #[inline(always)]
-    fn count(&self, block: usize, first: i32) -> usize {
-        let stop = self.stop[block]
-            .0
-            .iter()
-            .fold(0, |last, stop| last.max(*stop));
+    fn counts(&self, block: usize, first: i32) -> [usize; 2] {
+        let stop = self.stop[block].0;
+        let (mut soonest, mut last) = (i32::MAX, 0);
+        for stop in stop {
+            (soonest, last) = (soonest.min(stop), last.max(stop));
+        }
         let places = self.batch.places.of(block);
-        let is_behind = |place: &&u8| first + i32::from(**place) >= stop;
-        places.len() - places.iter().rev().take_while(is_behind).count()
+        let before = |stop| places.partition_point(|place| first + i32::from(*place) < stop);
+        [before(soonest), before(last)]
     }
 
-    /// Raw alphas of the first splats that reach a block.
+    /// Falloffs of the first splats that reach a block.
     #[inline(always)]
     fn evaluate<const FMA: bool>(&mut self, block: usize, count: usize, corner: [T; 2]) {
-        let [xs, ys] = centres(corner, block);
+        let Centres { x, y } = self.centres[block].beyond(corner);
         let pairs = &mut self.pairs[..count];
-        for (Aligned(pairs), splat) in pairs.iter_mut().zip(self.batch.reaching(block)) {
-            for i in 0..LANES {
-                [pairs.z1[i], pairs.z2[i]] = splat.z::<FMA>(xs[i], ys[i]);
+        for (Aligned(pairs), splat) in pairs.iter_mut().zip(self.batch.reaching(block, 0..count)) {
+            for i in 0..HALF {
+                let (z1, z2) = splat.z::<FMA>(x[i], [y[0][i], y[1][i]]);
+                pairs.z1[i] = z1;
+                [pairs.z2[0][i], pairs.z2[1][i]] = z2;
+                [pairs.falloff[i], pairs.falloff[HALF + i]] = squares::<T, FMA>(z1, z2);
             }
         }
-        // By itself, so that all that an exponential needs stays in registers.
-        for (Aligned(pairs), splat) in pairs.iter_mut().zip(self.batch.reaching(block)) {
+        // By themselves, so that all that an exponential needs stays in registers.
+        for Aligned(pairs) in pairs {
             for i in 0..LANES {
-                let square = square::<T, FMA>([pairs.z1[i], pairs.z2[i]]);
-                pairs.raw[i] = splat.raw::<FMA>(square);
+                pairs.falloff[i] = T::exp2_neg::<FMA>(pairs.falloff[i]);
             }
         }
     }
 
     /// What the loss thinks of the splats' colours at every pixel, c . grad.
     #[inline(always)]
-    fn look<const FMA: bool, const GROUP: usize>(
+    fn look<const FMA: bool, const COUNT: usize>(
         &mut self,
         first: usize,
-        view: &View<T>,
-        list: &[u32],
+        channels: usize,
         block: usize,
         count: usize,
     ) {
-        let planes = &self.grad[block * view.channels + first..][..GROUP];
-        let grads: [Lanes<T>; GROUP] = core::array::from_fn(|i| planes[i].0);
-        let places = self.batch.places.of(block);
-        for (Aligned(pairs), place) in self.pairs[..count].iter_mut().zip(places) {
-            let colors = view.colors::<GROUP>(list[usize::from(*place)], first);
+        let planes = &self.grad[block * channels + first..][..COUNT];
+        let grads: [Lanes<T>; COUNT] = core::array::from_fn(|i| planes[i].0);
+        let colors = self.batch.colors(block, first);
+        for (Aligned(pairs), colors) in self.pairs[..count].iter_mut().zip(colors) {
             let mut toward = if first == 0 {
                 [T::ZERO; LANES]
             } else {
@@ -233,24 +270,26 @@ impl<T: Real> GradientTile<T> {
         }
     }
 
-    /// Steps in front of the splats, the last one first: their weights and g.
+    /// Steps in front of some of the splats, the last one first: their weights and g. `STOPS` if a pixel may have stopped
+    /// before one of them.
     #[inline(always)]
-    fn step<const FMA: bool>(
+    fn step<const FMA: bool, const STOPS: bool>(
         &mut self,
         block: usize,
-        count: usize,
+        splats: Range<usize>,
         first: i32,
         thresholds: &Thresholds<T>,
     ) {
         let (mut transmittance, mut behind) = (self.transmittance[block].0, self.behind[block].0);
         let stop = self.stop[block].0;
-        let places = &self.batch.places.of(block)[..count];
-        for (Aligned(pairs), place) in self.pairs[..count].iter_mut().zip(places).rev() {
-            let (raw, toward) = (pairs.raw, pairs.toward);
+        let places = &self.batch.places.of(block)[splats.clone()];
+        let reaching = self.batch.reaching(block, splats.clone()).zip(places);
+        for (Aligned(pairs), (splat, place)) in self.pairs[splats].iter_mut().zip(reaching).rev() {
+            let (raw, toward) = (splat.raw(&pairs.falloff), pairs.toward);
             let place = first + i32::from(*place);
             let [mut weights, mut gs] = [[T::ZERO; LANES]; 2];
             for i in 0..LANES {
-                let blended = thresholds.seen(raw[i]) & (place < stop[i]);
+                let blended = thresholds.seen(raw[i]) & (!STOPS | (place < stop[i]));
                 // Every store is unconditional: masked ones are slow. Without a share nothing changes, exactly.
                 let share = if blended {
                     thresholds.alpha(raw[i])
@@ -258,15 +297,16 @@ impl<T: Real> GradientTile<T> {
                     T::ZERO
                 };
                 let inverse = T::ONE / (T::ONE - share);
-                let before = transmittance[i] * inverse;
-                let dalpha = before * toward[i] - behind[i] * inverse;
+                // The T in front is that behind times `inverse`.
+                let g = T::multiply_add::<FMA>(-transmittance[i], toward[i], behind[i]);
+                let g = raw[i] * inverse * g;
                 let live = blended & !thresholds.capped(raw[i]);
-                gs[i] = if live { -raw[i] * dalpha } else { T::ZERO };
-                weights[i] = share * before;
+                gs[i] = if live { g } else { T::ZERO };
+                transmittance[i] = transmittance[i] * inverse;
+                weights[i] = share * transmittance[i];
                 behind[i] = T::multiply_add::<FMA>(weights[i], toward[i], behind[i]);
-                transmittance[i] = before;
             }
-            (pairs.raw, pairs.toward) = (gs, weights);
+            (pairs.falloff, pairs.toward) = (gs, weights);
         }
         (self.transmittance[block].0, self.behind[block].0) = (transmittance, behind);
     }
@@ -277,19 +317,23 @@ impl<T: Real> GradientTile<T> {
         let places = self.batch.places.of(block);
         for (Aligned(pairs), place) in self.pairs[..count].iter().zip(places) {
             let sums = &mut self.sums[usize::from(*place) * width..][..MOMENTS];
-            let mut parts: [Parts<T>; MOMENTS] = core::array::from_fn(|i| sums[i].0);
-            let Pairs { z1, z2, raw: g, .. } = *pairs;
-            for half in [0, LANES / 2] {
-                for part in 0..LANES / 2 {
-                    let i = half + part;
-                    let (g1, g2) = (g[i] * z1[i], g[i] * z2[i]);
-                    parts[0][part] += g[i];
-                    parts[1][part] += g1;
-                    parts[2][part] += g2;
-                    parts[3][part] = T::multiply_add::<FMA>(g1, z1[i], parts[3][part]);
-                    parts[4][part] = T::multiply_add::<FMA>(g1, z2[i], parts[4][part]);
-                    parts[5][part] = T::multiply_add::<FMA>(g2, z2[i], parts[5][part]);
-                }
+            let mut parts: [Half<T>; MOMENTS] = core::array::from_fn(|i| sums[i].0);
+            let Pairs {
+                z1, z2, falloff: g, ..
+            } = *pairs;
+            for i in 0..HALF {
+                // z1 is that of both halves.
+                let (upper, lower) = (g[i], g[HALF + i]);
+                let (upper2, lower2) = (upper * z2[0][i], lower * z2[1][i]);
+                let (one, two) = (upper + lower, upper2 + lower2);
+                let one1 = one * z1[i];
+                parts[0][i] += one;
+                parts[1][i] += one1;
+                parts[2][i] += two;
+                parts[3][i] = T::multiply_add::<FMA>(one1, z1[i], parts[3][i]);
+                parts[4][i] = T::multiply_add::<FMA>(two, z1[i], parts[4][i]);
+                parts[5][i] = T::multiply_add::<FMA>(upper2, z2[0][i], parts[5][i]);
+                parts[5][i] = T::multiply_add::<FMA>(lower2, z2[1][i], parts[5][i]);
             }
             for (sum, parts) in sums.iter_mut().zip(parts) {
                 sum.0 = parts;
@@ -299,25 +343,25 @@ impl<T: Real> GradientTile<T> {
 
     /// Adds a block's weights times the gradient of the image.
     #[inline(always)]
-    fn add_colors<const FMA: bool, const GROUP: usize>(
+    fn add_colors<const FMA: bool, const COUNT: usize>(
         &mut self,
         first: usize,
         channels: usize,
         block: usize,
         count: usize,
     ) {
-        let planes = &self.grad[block * channels + first..][..GROUP];
-        let grads: [Lanes<T>; GROUP] = core::array::from_fn(|i| planes[i].0);
+        let planes = &self.grad[block * channels + first..][..COUNT];
+        let grads: [Lanes<T>; COUNT] = core::array::from_fn(|i| planes[i].0);
         let width = MOMENTS + channels;
         let places = self.batch.places.of(block);
         for (Aligned(pairs), place) in self.pairs[..count].iter().zip(places) {
             let at = usize::from(*place) * width + MOMENTS + first;
-            let sums = &mut self.sums[at..at + GROUP];
+            let sums = &mut self.sums[at..at + COUNT];
             let weights = pairs.toward;
             for (sum, grad) in sums.iter_mut().zip(&grads) {
                 let mut parts = sum.0;
-                for half in [0, LANES / 2] {
-                    for part in 0..LANES / 2 {
+                for half in [0, HALF] {
+                    for part in 0..HALF {
                         let (weight, grad) = (weights[half + part], grad[half + part]);
                         parts[part] = T::multiply_add::<FMA>(weight, grad, parts[part]);
                     }
@@ -330,7 +374,7 @@ impl<T: Real> GradientTile<T> {
 
 /// Sum of the parts: halves are added to halves.
 #[inline(always)]
-fn total<T: Real>(parts: &Parts<T>) -> T {
+fn total<T: Real>(parts: &Half<T>) -> T {
     let (mut sums, mut width) = (*parts, parts.len());
     while width > 1 {
         width /= 2;

@@ -21,6 +21,12 @@ pub(super) const BLOCKS: usize = ACROSS * ACROSS;
 /// One value per pixel of a block.
 pub(super) type Lanes<T> = [T; LANES];
 
+/// Half of a block's pixels, its upper or its lower rows: both lie in the same columns, and need some things only once.
+pub(super) const HALF: usize = LANES / 2;
+
+/// One value per pixel of half a block.
+pub(super) type Half<T> = [T; HALF];
+
 /// As wide registers want it in memory: what lies across two lines of the cache is read and written twice as slowly.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(32))]
@@ -41,7 +47,7 @@ pub(super) struct Splat<T> {
     w11: T,
     w21: T,
     w22: T,
-    pub(super) opacity: T,
+    opacity: T,
     /// `sigma <= cut` along a row at dy is `|dx - slope dy| <= sqrt(reach - shrink dy^2) inverse_a`.
     slope: T,
     reach: T,
@@ -102,20 +108,23 @@ impl<T: Real> Splat<T> {
         blocks as u16
     }
 
-    /// z1 and z2 at a pixel, in units of [`UNIT`].
+    /// z1 in a column of pixels, and z2 at two pixels of it, in units of [`UNIT`].
     #[inline(always)]
-    pub(super) fn z<const FMA: bool>(&self, x: T, y: T) -> [T; 2] {
-        let (dx, dy) = (x - self.mean[0], y - self.mean[1]);
-        [
-            self.w11 * dx,
-            T::multiply_add::<FMA>(self.w21, dx, self.w22 * dy),
-        ]
+    pub(super) fn z<const FMA: bool>(&self, x: T, [upper, lower]: [T; 2]) -> (T, [T; 2]) {
+        let dx = x - self.mean[0];
+        let z2_of_dx = self.w21 * dx;
+        let z2 = |y: T| T::multiply_add::<FMA>(self.w22, y - self.mean[1], z2_of_dx);
+        (self.w11 * dx, [z2(upper), z2(lower)])
     }
 
-    /// Raw alpha, given `|z|^2`.
+    /// Raw alphas at the pixels of a block, given the falloffs `2^-|z|^2`.
     #[inline(always)]
-    pub(super) fn raw<const FMA: bool>(&self, square: T) -> T {
-        self.opacity * T::exp2_neg::<FMA>(square)
+    pub(super) fn raw(&self, falloffs: &Lanes<T>) -> Lanes<T> {
+        let mut raw = *falloffs;
+        for i in 0..LANES {
+            raw[i] = self.opacity * falloffs[i];
+        }
+        raw
     }
 
     /// Gradients of screen mean, w11, w21, w22, and of the opacity, from a splat's sums of g times 1, z1, z2, z1^2, z1 z2
@@ -135,15 +144,40 @@ impl<T: Real> Splat<T> {
     }
 }
 
-/// Centres of the pixels of a block, along x and along y.
-#[inline(always)]
-pub(super) fn centres<T: Real>([left, top]: [T; 2], block: usize) -> [Lanes<T>; 2] {
-    let along = |corner: T, pixel: usize| corner + T::of(pixel as f64 + 0.5);
-    let (column, row) = (block % ACROSS * SIDE, block / ACROSS * SIDE);
-    [
-        core::array::from_fn(|i| along(left, column + i % SIDE)),
-        core::array::from_fn(|i| along(top, row + i / SIDE)),
-    ]
+/// Centres of the pixels of a block.
+#[derive(Clone, Copy)]
+pub(super) struct Centres<T> {
+    /// Of the upper and of the lower half.
+    pub(super) x: Half<T>,
+    pub(super) y: [Half<T>; 2],
+}
+
+impl<T: Real> Centres<T> {
+    /// Of each block of a tile, seen from its corner. To be kept in memory: if the compiler knew which of them are the
+    /// same, it would work on quarters and shuffle the results into place.
+    pub(super) fn of_blocks() -> [Self; BLOCKS] {
+        core::array::from_fn(|block| {
+            let along = |pixel: usize| T::of(pixel as f64 + 0.5);
+            let (column, row) = (block % ACROSS * SIDE, block / ACROSS * SIDE);
+            let rows = |first| core::array::from_fn(|i| along(row + (first + i) / SIDE));
+            Self {
+                x: core::array::from_fn(|i| along(column + i % SIDE)),
+                y: [rows(0), rows(HALF)],
+            }
+        })
+    }
+
+    /// From the corner of the image.
+    #[inline(always)]
+    pub(super) fn beyond(self, [left, top]: [T; 2]) -> Self {
+        let Self { mut x, mut y } = self;
+        for i in 0..HALF {
+            x[i] += left;
+            y[0][i] += top;
+            y[1][i] += top;
+        }
+        Self { x, y }
+    }
 }
 
 /// The corner of a tile, in pixels.
@@ -161,21 +195,27 @@ pub(super) fn in_blocks(column: usize, row: usize) -> [usize; 2] {
     ]
 }
 
-/// `|z|^2`. Both passes call it, so both see the same bits.
+/// `|z|^2` of two pixels of a column. Both passes call it, so both see the same bits.
 #[inline(always)]
-pub(super) fn square<T: Real, const FMA: bool>([z1, z2]: [T; 2]) -> T {
-    T::multiply_add::<FMA>(z1, z1, z2 * z2)
+pub(super) fn squares<T: Real, const FMA: bool>(z1: T, [upper, lower]: [T; 2]) -> [T; 2] {
+    let of_z1 = z1 * z1;
+    [
+        T::multiply_add::<FMA>(upper, upper, of_z1),
+        T::multiply_add::<FMA>(lower, lower, of_z1),
+    ]
 }
 
-/// Whether any lane passes.
+/// Whether any lane is less than a bound.
 #[inline(always)]
-pub(super) fn any<V: Copy>(lanes: &Lanes<V>, passes: impl Fn(V) -> bool) -> bool {
-    // One half onto the other, which leaves one register to look at.
-    let mut found = [false; LANES / 2];
-    for i in 0..LANES / 2 {
-        found[i] = passes(lanes[i]) | passes(lanes[i + LANES / 2]);
+pub(super) fn any_less<T: Real>(lanes: &Lanes<T>, bound: T) -> bool {
+    // The lesser ones of both halves, which leaves one register to look at.
+    let mut least = [T::ZERO; HALF];
+    for i in 0..HALF {
+        least[i] = lanes[i].least(lanes[i + HALF]);
     }
-    found.iter().fold(false, |any, found| any | found)
+    least
+        .iter()
+        .fold(false, |any, least| any | (*least < bound))
 }
 
 /// The one place that decides what becomes of a (pixel, splat) pair; both passes call it.
@@ -214,5 +254,11 @@ impl<T: Real> Thresholds<T> {
     #[inline(always)]
     pub(super) fn stops(&self, transmittance_after: T) -> bool {
         transmittance_after < self.transmittance_min
+    }
+
+    /// Whether any pixel of a block does.
+    #[inline(always)]
+    pub(super) fn any_stops(&self, transmittance_after: &Lanes<T>) -> bool {
+        any_less(transmittance_after, self.transmittance_min)
     }
 }
