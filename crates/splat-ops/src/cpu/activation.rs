@@ -7,7 +7,8 @@ use burn::backend::flex::FlexTensor;
 use burn::tensor::TensorData;
 use rayon::prelude::*;
 
-use super::buffer::{Buffer, overwritten};
+use super::buffer::Buffer;
+use super::parts::Uncleared;
 use super::real::Real;
 use super::simd::vectorized;
 use crate::activation::Activation;
@@ -22,14 +23,15 @@ pub(super) fn forward<T: Real>(
 ) -> FlexTensor {
     let shape = x.shape();
     let x = Buffer::new(x);
-    let mut y = overwritten::<T>(shape.num_elements());
-    y.par_chunks_mut(CHUNK)
+    let mut y = Uncleared::<T>::new(shape.num_elements());
+    y.chunks(CHUNK)
+        .into_par_iter()
         .zip(x.slice::<T>().par_chunks(CHUNK))
         .for_each(|(y, x)| match function {
-            Activation::Exp => exp(x, y),
-            Activation::Sigmoid => sigmoid(x, y),
+            Activation::Exp => exp(x, y.overwritten()),
+            Activation::Sigmoid => sigmoid(x, y.overwritten()),
         });
-    FlexTensor::from_data(TensorData::new(y, shape))
+    FlexTensor::from_data(TensorData::new(y.written(), shape))
 }
 
 pub(super) fn backward<T: Real>(
@@ -41,16 +43,17 @@ pub(super) fn backward<T: Real>(
 ) -> FlexTensor {
     let shape = x.shape();
     let (x, y, grad) = (Buffer::new(x), Buffer::new(y), Buffer::new(grad));
-    let mut out = overwritten::<T>(shape.num_elements());
-    out.par_chunks_mut(CHUNK)
+    let mut out = Uncleared::<T>::new(shape.num_elements());
+    out.chunks(CHUNK)
+        .into_par_iter()
         .zip(x.slice::<T>().par_chunks(CHUNK))
         .zip(y.slice::<T>().par_chunks(CHUNK))
         .zip(grad.slice::<T>().par_chunks(CHUNK))
         .for_each(|(((out, x), y), grad)| match function {
-            Activation::Exp => multiply(grad, y, out),
-            Activation::Sigmoid => sigmoid_backward(x, grad, out),
+            Activation::Exp => multiply(grad, y, out.overwritten()),
+            Activation::Sigmoid => sigmoid_backward(x, grad, out.overwritten()),
         });
-    FlexTensor::from_data(TensorData::new(out, shape))
+    FlexTensor::from_data(TensorData::new(out.written(), shape))
 }
 
 vectorized! {

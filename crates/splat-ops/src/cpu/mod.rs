@@ -13,6 +13,7 @@ pub(crate) mod buffer;
 mod instructions;
 mod intersect;
 mod math;
+mod parts;
 mod photometric;
 #[cfg(test)]
 pub(crate) mod poison;

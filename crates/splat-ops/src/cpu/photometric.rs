@@ -12,7 +12,8 @@ use burn::backend::flex::FlexTensor;
 use burn::backend::{Flex, TensorMetadata};
 use rayon::prelude::*;
 
-use super::buffer::{Buffer, overwritten, tensor};
+use super::buffer::{Buffer, tensor};
+use super::parts::{Part, Uncleared};
 use super::real::Real;
 use crate::backend::Target;
 use crate::ssim::SsimArgs;
@@ -40,12 +41,16 @@ pub(super) fn measure_tracked<T: Real>(
     args: &SsimArgs,
 ) -> (FlexTensor, FlexTensor) {
     let pictures = Pictures::new(rendered, target);
-    let mut slope = overwritten::<T>(pictures.shape.iter().product());
+    let mut slope = Uncleared::<T>::new(pictures.shape.iter().product());
     let means = means(&pictures, args, Some(&mut slope));
-    (means, tensor(slope, pictures.shape))
+    (means, tensor(slope.written(), pictures.shape))
 }
 
-fn means<T: Real>(pictures: &Pictures, args: &SsimArgs, slope: Option<&mut [T]>) -> FlexTensor {
+fn means<T: Real>(
+    pictures: &Pictures,
+    args: &SsimArgs,
+    slope: Option<&mut Uncleared<T>>,
+) -> FlexTensor {
     let [b, h, w, d] = pictures.shape;
     let sweep = Sweep::<T>::new(pictures, args);
     let mut bands: Vec<Band<T>> = (0..b)
@@ -56,12 +61,10 @@ fn means<T: Real>(pictures: &Pictures, args: &SsimArgs, slope: Option<&mut [T]>)
             slope: None,
         })
         .collect();
-    if let Some(slope) = slope.filter(|slope| !slope.is_empty()) {
-        let pieces = slope
-            .chunks_exact_mut(h * w * d)
-            .flat_map(|image| image.chunks_mut(BAND * w * d));
-        for (band, piece) in bands.iter_mut().zip(pieces) {
-            band.slope = Some(piece);
+    if let Some(slope) = slope {
+        let parts = slope.chunks_of_each(b, BAND * w * d);
+        for (band, (.., part)) in bands.iter_mut().zip(parts) {
+            band.slope = Some(part);
         }
     }
     let sums: Vec<[f64; 2]> = bands
@@ -69,7 +72,8 @@ fn means<T: Real>(pictures: &Pictures, args: &SsimArgs, slope: Option<&mut [T]>)
         // Or else the last bands would often be worked on by one thread alone.
         .with_max_len(1)
         .map_init(Scratch::default, |scratch, band| {
-            sweep.band(band.image, band.rows, band.slope, scratch)
+            let slope = band.slope.map(Part::overwritten);
+            sweep.band(band.image, band.rows, slope, scratch)
         })
         .collect();
     let counts = [b * h * w * d, sweep.count];
@@ -84,7 +88,7 @@ fn means<T: Real>(pictures: &Pictures, args: &SsimArgs, slope: Option<&mut [T]>)
 struct Band<'a, T> {
     image: usize,
     rows: Range<usize>,
-    slope: Option<&'a mut [T]>,
+    slope: Option<Part<'a, T>>,
 }
 
 /// Gradient of `rendered`, given that of the means and what [`measure_tracked`] left.
@@ -102,17 +106,16 @@ pub(super) fn backward<T: Real>(
     let (slope, grad) = (slope.slice::<T>(), grad.slice::<T>());
     let weights = [grad[0] / T::of((b * h * w * d) as f64), -grad[1]];
     let rows = pictures.rows::<T>();
-    let mut out = overwritten::<T>(b * h * w * e);
-    if !out.is_empty() {
-        out.par_chunks_mut(w * e).enumerate().for_each_init(
-            || [(); 3].map(|()| vec![T::ZERO; w * d]),
-            |[x, y, gradient], (row, out)| {
-                rows.load(row, 0..w, x, y);
-                let slope = &slope[row * w * d..(row + 1) * w * d];
-                rows::gradient([x, y, slope], weights, gradient);
-                spread([d, e], gradient, out);
-            },
-        );
-    }
-    tensor(out, [b, h, w, e])
+    let mut out = Uncleared::<T>::new(b * h * w * e);
+    let parts = out.chunks(w * e).into_par_iter();
+    parts.enumerate().for_each_init(
+        || [(); 3].map(|()| vec![T::ZERO; w * d]),
+        |[x, y, gradient], (row, out)| {
+            rows.load(row, 0..w, x, y);
+            let slope = &slope[row * w * d..(row + 1) * w * d];
+            rows::gradient([x, y, slope], weights, gradient);
+            spread([d, e], gradient, out.overwritten());
+        },
+    );
+    tensor(out.written(), [b, h, w, e])
 }

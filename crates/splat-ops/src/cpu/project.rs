@@ -27,7 +27,8 @@ use rayon::prelude::*;
 
 use self::gradient::splat_backward;
 use self::splat::{Camera, Gaussian, Splat};
-use super::buffer::{Buffer, overwritten, tensor, zeros};
+use super::buffer::{Buffer, tensor};
+use super::parts::Uncleared;
 use super::real::Real;
 use super::simd::{LANES, Lanes, for_each_block, vectorized};
 use crate::backend::PROJECTED_WIDTH;
@@ -119,32 +120,24 @@ pub(super) fn forward<T: Real>(
     let buffers = inputs.map(Buffer::new);
     let inputs = Inputs::<T>::new(&buffers, args);
     let (c, n) = (inputs.cameras.len(), inputs.count());
-    let mut packed = overwritten::<T>(c * n * PROJECTED_WIDTH);
-    if n > 0 {
-        for (camera, packed) in inputs
-            .cameras
-            .iter()
-            .zip(packed.chunks_exact_mut(n * PROJECTED_WIDTH))
-        {
-            packed
-                .par_chunks_mut(LANES * PROJECTED_WIDTH)
-                .with_min_len(CHUNK / LANES)
-                .enumerate()
-                .for_each(|(block, packed)| {
-                    let first = block * LANES;
-                    let count = packed.len() / PROJECTED_WIDTH;
-                    let gaussians = inputs.load(first..first + count);
-                    let mut columns = [[T::ZERO; LANES]; PROJECTED_WIDTH];
-                    project_lanes(&gaussians, camera, &mut columns);
-                    for (lane, row) in packed.chunks_exact_mut(PROJECTED_WIDTH).enumerate() {
-                        for (value, column) in row.iter_mut().zip(&columns) {
-                            *value = column[lane];
-                        }
-                    }
-                });
+    let mut packed = Uncleared::<T>::new(c * n * PROJECTED_WIDTH);
+    let parts = packed.chunks_of_each(c, CHUNK * PROJECTED_WIDTH);
+    parts.into_par_iter().for_each(|(camera, first, part)| {
+        let first = first / PROJECTED_WIDTH;
+        let blocks = part.overwritten().chunks_mut(LANES * PROJECTED_WIDTH);
+        for (first, packed) in (first..).step_by(LANES).zip(blocks) {
+            let count = packed.len() / PROJECTED_WIDTH;
+            let gaussians = inputs.load(first..first + count);
+            let mut columns = [[T::ZERO; LANES]; PROJECTED_WIDTH];
+            project_lanes(&gaussians, &inputs.cameras[camera], &mut columns);
+            for (lane, row) in packed.chunks_exact_mut(PROJECTED_WIDTH).enumerate() {
+                for (value, column) in row.iter_mut().zip(&columns) {
+                    *value = column[lane];
+                }
+            }
         }
-    }
-    tensor(packed, [c, n, PROJECTED_WIDTH])
+    });
+    tensor(packed.written(), [c, n, PROJECTED_WIDTH])
 }
 
 vectorized! {
@@ -245,18 +238,19 @@ pub(super) fn backward<T: Real>(
     let grad = grad.slice::<T>();
     let (c, n) = (inputs.cameras.len(), inputs.count());
 
-    let [mut means, mut quats, mut scales] = [3, 4, 3].map(|width| zeros::<T>(n * width));
+    let [mut means, mut quats, mut scales] = [3, 4, 3].map(|width| Uncleared::<T>::new(n * width));
     let of_cameras: Vec<Vec<[T; CAMERA]>> = means
-        .par_chunks_mut(3 * CHUNK)
-        .zip(quats.par_chunks_mut(4 * CHUNK))
-        .zip(scales.par_chunks_mut(3 * CHUNK))
+        .chunks(3 * CHUNK)
+        .into_par_iter()
+        .zip(quats.chunks(4 * CHUNK))
+        .zip(scales.chunks(3 * CHUNK))
         .enumerate()
         .map(|(chunk, ((means, quats), scales))| {
             let mut chunk = Chunk {
                 rows: chunk * CHUNK..n.min((chunk + 1) * CHUNK),
-                means,
-                quats,
-                scales,
+                means: means.cleared(),
+                quats: quats.cleared(),
+                scales: scales.cleared(),
             };
             let views = inputs
                 .cameras
@@ -276,6 +270,7 @@ pub(super) fn backward<T: Real>(
             }
         }
     }
+    let [means, quats, scales] = [means, quats, scales].map(Uncleared::written);
     [
         wanted[0].then(|| tensor(means, [n, 3])),
         wanted[1].then(|| tensor(quats, [n, 4])),

@@ -26,8 +26,9 @@ use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 use tracing::trace_span;
 
-use super::buffer::{Buffer, overwritten, tensor, zeros};
+use super::buffer::{Buffer, tensor, zeros};
 use super::intersect::{CHUNK, Grid, TILE, TileLists};
+use super::parts::{Part, Uncleared};
 use super::real::Real;
 use super::simd::{prefetch, vectorized};
 use crate::OpError;
@@ -79,19 +80,21 @@ impl<T: Real> Listed<T> {
             TileLists::new(camera.packed, camera.colors, camera.opacities, args)?;
         let splats = footprints.par_iter().with_min_len(CHUNK).map(Splat::new);
         let d = camera.channels;
-        let mut colors = overwritten::<T>(lists.listed.len() * d);
+        let mut colors = Uncleared::<T>::new(lists.listed.len() * d);
         colors
-            .par_chunks_exact_mut(d)
-            .with_min_len(CHUNK)
-            .zip(&lists.listed)
-            .for_each(|(color, n)| {
-                let n = *n as usize;
-                color.copy_from_slice(&camera.colors[n * d..(n + 1) * d]);
+            .chunks(CHUNK * d)
+            .into_par_iter()
+            .zip(lists.listed.par_chunks(CHUNK))
+            .for_each(|(colors, listed)| {
+                for (color, n) in colors.overwritten().chunks_exact_mut(d).zip(listed) {
+                    let n = *n as usize;
+                    color.copy_from_slice(&camera.colors[n * d..(n + 1) * d]);
+                }
             });
         Ok(Self {
             splats: splats.collect(),
             lists,
-            colors,
+            colors: colors.written(),
             channels: d,
         })
     }
@@ -231,24 +234,28 @@ pub(super) fn forward<T: Real>(
     let inputs = Inputs::new(inputs, background);
     let [c, _, d] = inputs.dims();
     let (w, h) = (args.size.width as usize, args.size.height as usize);
-    let mut image = overwritten::<T>(c * h * w * (d + 1));
+    let shape = [c, h, w, d + 1];
+    let mut image = Uncleared::<T>::new(shape.iter().product());
     let mut frames = Vec::with_capacity(c);
 
-    for (index, image) in image.chunks_exact_mut(h * w * (d + 1)).enumerate() {
+    let slab = |first: usize| TILE.min(h - first) * w * (d + 1);
+    let slabs = (0..c).flat_map(|_| (0..h).step_by(TILE).map(slab));
+    let mut slabs = image.parts(slabs).into_iter();
+    for index in 0..c {
         let camera = inputs.camera::<T>(index);
         match Listed::new(&camera, args) {
-            Ok(listed) => frames.push(blend(listed, camera.background, args, image)),
+            Ok(listed) => {
+                let slabs = slabs.by_ref().take(h.div_ceil(TILE)).collect();
+                frames.push(blend(listed, camera.background, args, slabs));
+            }
             Err(error) => {
                 args.errors.report(error);
-                frames.clear();
-                break;
+                let nothing = tensor(zeros::<T>(shape.iter().product()), shape);
+                return (nothing, State::new::<T>(Vec::new()));
             }
         }
     }
-    if frames.len() < c {
-        image.fill(T::ZERO);
-    }
-    (tensor(image, [c, h, w, d + 1]), State::new(frames))
+    (tensor(image.written(), shape), State::new(frames))
 }
 
 /// Renders one camera's image.
@@ -256,23 +263,23 @@ fn blend<T: Real>(
     listed: Listed<T>,
     background: Option<&[T]>,
     args: &RasterizeArgs,
-    image: &mut [T],
+    image: Vec<Part<T>>,
 ) -> Frame<T> {
     let view = View::new(&listed, background, args);
     let (slab, pixels) = (view.slab(), view.width * view.height);
-    let mut transmittance = overwritten::<T>(pixels);
-    let mut stop = overwritten::<i32>(pixels);
+    let mut transmittance = Uncleared::<T>::new(pixels);
+    let mut stop = Uncleared::<i32>::new(pixels);
     let reached = image
-        .par_chunks_mut(slab * (view.channels + 1))
-        .zip(transmittance.par_chunks_mut(slab))
-        .zip(stop.par_chunks_mut(slab))
+        .into_par_iter()
+        .zip(transmittance.chunks(slab))
+        .zip(stop.chunks(slab))
         .enumerate()
         .with_max_len(ROWS_AT_ONCE)
         .map(|(ty, ((image, transmittance), stop))| {
             let slab = Slab {
-                image,
-                transmittance,
-                stop,
+                image: image.overwritten(),
+                transmittance: transmittance.overwritten(),
+                stop: stop.overwritten(),
             };
             blend_row_of_tiles(&view, ty, slab)
         })
@@ -280,8 +287,8 @@ fn blend<T: Real>(
     Frame {
         listed,
         reached,
-        transmittance,
-        stop,
+        transmittance: transmittance.written(),
+        stop: stop.written(),
     }
 }
 
@@ -318,12 +325,23 @@ pub(super) fn backward<T: Real>(
     let pixels = args.size.width as usize * args.size.height as usize * (d + 1);
     let grad = Buffer::new(grad_output);
     let grad = grad.slice::<T>();
-    let mut out = Gradients {
-        packed: zeros(c * n * PROJECTED_WIDTH),
-        colors: zeros(c * n * d),
-        opacities: zeros(c * n),
-        background: vec![T::ZERO; c * d],
-    };
+    let mut of_background = vec![T::ZERO; c * d];
+    let mut packed = Uncleared::new(c * n * PROJECTED_WIDTH);
+    let mut colors = Uncleared::new(c * n * d);
+    let mut opacities = Uncleared::new(c * n);
+    let mut rows = packed
+        .chunks_of_each(c, CHUNK * PROJECTED_WIDTH)
+        .into_iter()
+        .zip(colors.chunks_of_each(c, CHUNK * d))
+        .zip(opacities.chunks_of_each(c, CHUNK))
+        .map(
+            |(((.., packed), (.., colors)), (_, first, opacities))| GradientRows {
+                first,
+                packed,
+                colors,
+                opacities,
+            },
+        );
     for (index, frame) in state.frames::<T>().iter().enumerate() {
         let background = inputs.camera::<T>(index).background;
         let view = View::new(&frame.listed, background, args);
@@ -334,28 +352,35 @@ pub(super) fn backward<T: Real>(
         };
         // Every (tile, splat) pair writes its own row; each splat then sums its rows in order.
         let width = MOMENTS + d;
-        let mut partials = overwritten::<T>(view.lists.instances() * width);
-        let slabs = split_by_tile_row(&mut partials, view.lists, view.grid, width);
-        let backgrounds: Vec<Vec<T>> = slabs
+        let mut partials = Uncleared::<T>::new(view.lists.instances() * width);
+        let of_row = |ty: usize| view.lists.row_of_tiles(ty, view.grid).len() * width;
+        let backgrounds: Vec<Vec<T>> = partials
+            .parts((0..view.grid.rows).map(of_row))
             .into_par_iter()
             .enumerate()
             .with_max_len(ROWS_AT_ONCE)
             .map(|(ty, partials)| {
+                let partials = partials.overwritten();
                 row_of_tiles_backward(&view, &frame.reached[ty], &upstream, ty, partials)
             })
             .collect();
         for row in backgrounds {
-            for (sum, value) in out.background[index * d..].iter_mut().zip(row) {
+            for (sum, value) in of_background[index * d..].iter_mut().zip(row) {
                 *sum += value;
             }
         }
-        out.reduce(index * n, n, &partials, &frame.listed);
+        let partials = partials.written();
+        let rows: Vec<_> = rows.by_ref().take(n.div_ceil(CHUNK)).collect();
+        rows.into_par_iter()
+            .for_each(|rows| rows.write(&frame.listed, &partials));
     }
+    // Nothing was rendered by a camera without a frame.
+    rows.for_each(GradientRows::clear);
     [
-        wanted[0].then(|| tensor(out.packed, [c, n, PROJECTED_WIDTH])),
-        wanted[1].then(|| tensor(out.colors, [c, n, d])),
-        wanted[2].then(|| tensor(out.opacities, [c, n])),
-        wanted[3].then(|| tensor(out.background, [c, d])),
+        wanted[0].then(|| tensor(packed.written(), [c, n, PROJECTED_WIDTH])),
+        wanted[1].then(|| tensor(colors.written(), [c, n, d])),
+        wanted[2].then(|| tensor(opacities.written(), [c, n])),
+        wanted[3].then(|| tensor(of_background, [c, d])),
     ]
 }
 
@@ -385,58 +410,41 @@ vectorized! {
     }
 }
 
-/// The part of `partials` that belongs to each row of tiles.
-fn split_by_tile_row<'a, T>(
-    mut partials: &'a mut [T],
-    lists: &TileLists,
-    grid: Grid,
-    width: usize,
-) -> Vec<&'a mut [T]> {
-    (0..grid.rows)
-        .map(|ty| {
-            let length = lists.row_of_tiles(ty, grid).len() * width;
-            let (slab, rest) = core::mem::take(&mut partials).split_at_mut(length);
-            partials = rest;
-            slab
-        })
-        .collect()
+/// Gradients of up to [`CHUNK`] Gaussians in one camera.
+struct GradientRows<'a, T> {
+    /// The first Gaussian.
+    first: usize,
+    packed: Part<'a, T>,
+    colors: Part<'a, T>,
+    opacities: Part<'a, T>,
 }
 
-/// Gradients of the four inputs.
-struct Gradients<T> {
-    packed: Vec<T>,
-    colors: Vec<T>,
-    opacities: Vec<T>,
-    background: Vec<T>,
-}
-
-impl<T: Real> Gradients<T> {
-    /// Turns what each splat of a camera has in its tiles into gradients. The camera's rows begin at `first`.
-    fn reduce(&mut self, first: usize, n: usize, partials: &[T], frame: &Listed<T>) {
+impl<T: Real> GradientRows<'_, T> {
+    /// From what each splat has in its tiles.
+    fn write(self, frame: &Listed<T>, partials: &[T]) {
         let d = frame.channels;
-        let rows = first..first + n;
-        self.packed[rows.start * PROJECTED_WIDTH..rows.end * PROJECTED_WIDTH]
-            .par_chunks_mut(CHUNK * PROJECTED_WIDTH)
-            .zip(self.colors[rows.start * d..rows.end * d].par_chunks_mut(CHUNK * d))
-            .zip(self.opacities[rows].par_chunks_mut(CHUNK))
-            .enumerate()
-            .for_each(|(chunk, ((packed, colors), opacities))| {
-                let first = chunk * CHUNK;
-                let listed = &frame.lists.listed;
-                let at = |n: usize| listed.partition_point(|listed| (*listed as usize) < n);
-                let mut sums = vec![T::ZERO; MOMENTS + d];
-                for splat in at(first)..at(first + opacities.len()) {
-                    frame.sum(splat, partials, &mut sums);
-                    let (moments, of_color) = sums.split_at(MOMENTS);
-                    let moments = core::array::from_fn(|i| moments[i]);
-                    let (geometry, of_opacity) = frame.splats[splat].gradients(moments);
-                    let row = listed[splat] as usize - first;
-                    let packed = &mut packed[row * PROJECTED_WIDTH..][..PROJECTED_WIDTH];
-                    packed[..2].copy_from_slice(&geometry[..2]);
-                    packed[3..6].copy_from_slice(&geometry[2..]);
-                    colors[row * d..][..d].copy_from_slice(of_color);
-                    opacities[row] = of_opacity;
-                }
-            });
+        let [packed, colors, opacities] =
+            [self.packed, self.colors, self.opacities].map(Part::cleared);
+        let listed = &frame.lists.listed;
+        let at = |n: usize| listed.partition_point(|listed| (*listed as usize) < n);
+        let mut sums = vec![T::ZERO; MOMENTS + d];
+        for splat in at(self.first)..at(self.first + opacities.len()) {
+            frame.sum(splat, partials, &mut sums);
+            let (moments, of_color) = sums.split_at(MOMENTS);
+            let moments = core::array::from_fn(|i| moments[i]);
+            let (geometry, of_opacity) = frame.splats[splat].gradients(moments);
+            let row = listed[splat] as usize - self.first;
+            let packed = &mut packed[row * PROJECTED_WIDTH..][..PROJECTED_WIDTH];
+            packed[..2].copy_from_slice(&geometry[..2]);
+            packed[3..6].copy_from_slice(&geometry[2..]);
+            colors[row * d..][..d].copy_from_slice(of_color);
+            opacities[row] = of_opacity;
+        }
+    }
+
+    fn clear(self) {
+        for part in [self.packed, self.colors, self.opacities] {
+            part.cleared();
+        }
     }
 }

@@ -10,8 +10,9 @@ use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
-use super::buffer::{Buffer, overwritten, tensor, zeros};
+use super::buffer::{Buffer, tensor};
 use super::math::{Vec3, dot};
+use super::parts::{Part, Uncleared};
 use super::real::Real;
 use super::simd::{LANES, Lanes, for_each_block, vectorized};
 use super::spherical_harmonics::{
@@ -196,32 +197,27 @@ pub(super) fn forward<T: Real>(
     let tensors = Tensors::new(inputs);
     let inputs = tensors.slices::<T>(degree);
     let (c, n) = (inputs.centers.len() / 3, inputs.count());
-    let mut colors = overwritten::<T>(c * n * 3);
-    if n > 0 {
-        let views = colors.chunks_exact_mut(n * 3);
-        for (center, colors) in inputs.centers.chunks_exact(3).zip(views) {
-            colors
-                .par_chunks_mut(3 * LANES)
-                .with_min_len(CHUNK / LANES)
-                .enumerate()
-                .for_each(|(block, colors)| {
-                    let first = block * LANES;
-                    let rows = first..first + colors.len() / 3;
-                    let directions = inputs.directions(rows.clone(), center);
-                    let mut units = [[T::ZERO; LANES]; 4];
-                    let mut basis = [[T::ZERO; LANES]; COUNT_MAX];
-                    evaluate(degree, &directions, &mut units, &mut basis);
-                    for (lane, (n, out)) in rows.zip(colors.chunks_exact_mut(3)).enumerate() {
-                        let color = inputs.color(n, &basis, lane);
-                        for (out, value) in out.iter_mut().zip(color) {
-                            // NaN stays.
-                            *out = if value < T::ZERO { T::ZERO } else { value };
-                        }
-                    }
-                });
+    let mut colors = Uncleared::<T>::new(c * n * 3);
+    let parts = colors.chunks_of_each(c, 3 * CHUNK);
+    parts.into_par_iter().for_each(|(camera, first, part)| {
+        let center = &inputs.centers[3 * camera..3 * camera + 3];
+        let blocks = part.overwritten().chunks_mut(3 * LANES);
+        for (first, colors) in (first / 3..).step_by(LANES).zip(blocks) {
+            let rows = first..first + colors.len() / 3;
+            let directions = inputs.directions(rows.clone(), center);
+            let mut units = [[T::ZERO; LANES]; 4];
+            let mut basis = [[T::ZERO; LANES]; COUNT_MAX];
+            evaluate(degree, &directions, &mut units, &mut basis);
+            for (lane, (n, out)) in rows.zip(colors.chunks_exact_mut(3)).enumerate() {
+                let color = inputs.color(n, &basis, lane);
+                for (out, value) in out.iter_mut().zip(color) {
+                    // NaN stays.
+                    *out = if value < T::ZERO { T::ZERO } else { value };
+                }
+            }
         }
-    }
-    tensor(colors, [c, n, 3])
+    });
+    tensor(colors.written(), [c, n, 3])
 }
 
 /// The gradients of one chunk of Gaussians, where they belong; those that are not wanted are empty.
@@ -336,31 +332,26 @@ pub(super) fn backward<T: Real>(
     let grad = grad.slice::<T>();
     let (c, n) = (inputs.centers.len() / 3, inputs.count());
 
-    let rows = |wanted: bool, width: usize| zeros::<T>(if wanted { n * width } else { 0 });
-    let mut sh0 = rows(wanted[0], 3);
-    let mut rest = rows(wanted[1], 3 * inputs.stored);
-    let mut means = rows(wanted[2], 3);
-    let mut parts = [
-        slabs(&mut sh0, n, 3),
-        slabs(&mut rest, n, 3 * inputs.stored),
-        slabs(&mut means, n, 3),
-    ]
-    .map(Vec::into_iter);
-    let chunks: Vec<Chunk<T>> = (0..n.div_ceil(CHUNK))
-        .map(|chunk| {
-            let [sh0, rest, means] = parts.each_mut().map(|part| part.next().unwrap_or_default());
-            Chunk {
+    let widths = [3, 3 * inputs.stored, 3];
+    let mut out = [0, 1, 2].map(|i| Uncleared::<T>::new(if wanted[i] { n * widths[i] } else { 0 }));
+    let [sh0, rest, means] = &mut out;
+    let mut parts = [(sh0, widths[0]), (rest, widths[1]), (means, widths[2])]
+        .map(|(out, width)| out.chunks(CHUNK * width).into_iter());
+    let parts: Vec<[Option<Part<T>>; 3]> = (0..n.div_ceil(CHUNK))
+        .map(|_| parts.each_mut().map(Iterator::next))
+        .collect();
+    let of_centers: Vec<Vec<Vec3<T>>> = parts
+        .into_par_iter()
+        .enumerate()
+        .map(|(chunk, parts)| {
+            let [sh0, rest, means] = parts.map(|part| part.map_or(&mut [][..], Part::cleared));
+            let mut chunk = Chunk {
                 rows: chunk * CHUNK..n.min((chunk + 1) * CHUNK),
                 sh0,
                 rest,
                 means,
                 directions: wanted[2] || wanted[3],
-            }
-        })
-        .collect();
-    let of_centers: Vec<Vec<Vec3<T>>> = chunks
-        .into_par_iter()
-        .map(|mut chunk| {
+            };
             let views = inputs.centers.chunks_exact(3).zip(grad.chunks_exact(3 * n));
             views
                 .map(|(center, grad)| chunk.add(&inputs, center, grad))
@@ -374,18 +365,11 @@ pub(super) fn backward<T: Real>(
             *sum += *value;
         }
     }
+    let [sh0, rest, means] = out.map(Uncleared::written);
     [
         wanted[0].then(|| tensor(sh0, [n, 1, 3])),
         wanted[1].then(|| tensor(rest, [n, inputs.stored, 3])),
         wanted[2].then(|| tensor(means, [n, 3])),
         wanted[3].then(|| tensor(centers, [c, 3])),
     ]
-}
-
-/// The rows of each chunk of Gaussians.
-fn slabs<T>(values: &mut [T], n: usize, width: usize) -> Vec<&mut [T]> {
-    if values.len() < n * width {
-        return Vec::new();
-    }
-    values.chunks_mut((CHUNK * width).max(1)).collect()
 }
