@@ -3,6 +3,7 @@
 use cubecl::client::Client;
 use cubecl::features::{AtomicUsage, Plane};
 
+use crate::launch::{MOST_BUFFERS, bindable_buffers};
 use crate::{rasterize, sort};
 
 /// What is known of the client's device, by name, in an order for reading.
@@ -30,6 +31,11 @@ pub fn describe(client: &Client) -> Vec<(&'static str, String)> {
             format!("{} bytes a workgroup", hardware.max_shared_memory_size),
         ),
     ];
+    let buffers = format!(
+        "{} a kernel, {MOST_BUFFERS} needed",
+        bindable_buffers(client)
+    );
+    facts.push(("storage buffers", buffers));
     if let Some(count) = hardware.num_streaming_multiprocessors {
         facts.push(("multiprocessors", count.to_string()));
     }

@@ -16,6 +16,17 @@ pub const CUBE_UNITS: u32 = 256;
 /// [`CUBE_UNITS`] as an index.
 pub(crate) const CUBE_UNITS_USIZE: usize = CUBE_UNITS as usize;
 
+/// Most storage buffers that a kernel of this crate binds. In WGSL CubeCL binds one more, with lengths and scalars.
+///
+/// Devices promise no more than 8 (`max_storage_buffers_per_shader_stage`, WebGPU's default); wgpu itself says 16 of
+/// DirectX devices without resource binding tier 3 and 29 of Metal.
+pub const MOST_BUFFERS: u32 = 12;
+
+/// How many storage buffers kernels can bind on this device, CubeCL's own left out.
+pub fn bindable_buffers(client: &Client) -> u32 {
+    client.properties().hardware.max_bindings
+}
+
 /// WebGPU's limit on workgroups along one dimension.
 const MAX_CUBES_PER_DIMENSION: u32 = 65_535;
 

@@ -41,7 +41,7 @@ mod work;
 pub use describe::describe;
 #[doc(hidden)]
 pub use launch::poison;
-pub use launch::{Buffer, CUBE_UNITS, HalfBuffer, reads_half};
+pub use launch::{Buffer, CUBE_UNITS, HalfBuffer, MOST_BUFFERS, bindable_buffers, reads_half};
 #[doc(hidden)]
 pub use planes::force_plane_size;
 pub use planes::plane_size;

@@ -31,7 +31,7 @@ use self::backward::{SHAPE_GRADIENTS, SlotLayout, rasterize_backward};
 use self::forward::rasterize_forward;
 use self::pair::thresholds;
 pub use self::sums::Sums;
-use self::sums::sum_slots;
+use self::sums::{SlotTargetLaunch, SplatTargetLaunch, TargetArgs, sum_slots};
 use self::tile::Plan;
 use crate::floor::{Bytes, Sizes};
 use crate::intersect::{Frames, IntersectError, Slots, TileLists, intersect_ahead};
@@ -172,8 +172,6 @@ fn blend(
     let output = Buffer::empty(client, pixels * (inputs.channels + 1));
     let transmittance = Buffer::empty(client, pixels);
     let walked = Buffer::empty(client, pixels);
-    let background = inputs.background.clone();
-    let background = background.unwrap_or_else(|| Buffer::empty(client, 1));
     for first_channel in (0..inputs.channels).step_by(plan.channels()) {
         rasterize_forward::launch(
             client,
@@ -182,7 +180,7 @@ fn blend(
             inputs.packed.arg(),
             inputs.colors.arg(),
             inputs.opacities.arg(),
-            background.arg(),
+            inputs.background.as_ref().map(Buffer::arg).into(),
             lists.splats.arg(),
             lists.ranges.arg(),
             output.arg(),
@@ -194,7 +192,6 @@ fn blend(
             first_channel as u32,
             plan,
             plan.channels().min(inputs.channels - first_channel),
-            inputs.background.is_some(),
             first_channel == 0,
             counting,
         );
@@ -428,7 +425,8 @@ impl Launch<'_> {
         let splats = self.frames.splats();
         let values = self.layout.values();
         let slot_gradients = zeros(self.client, self.state.lists.instances * values);
-        self.tiles::<u32>(Sums::Ordered, &slots.of, &slot_gradients, gradients);
+        let target = SlotTargetLaunch::new(slots.of.arg(), slot_gradients.arg());
+        self.tiles::<u32>(Sums::Ordered, TargetArgs::Slots(target));
         if let Some((count, dim)) = per_element(splats * values) {
             sum_slots::launch(
                 self.client,
@@ -452,24 +450,16 @@ impl Launch<'_> {
 
     /// Added to the gradients, which are zero before the first launch.
     fn as_they_come<A: Numeric>(&self, sums: Sums, gradients: &[Buffer; 3]) {
-        let none = [(); 2].map(|()| Buffer::empty(self.client, 1));
-        self.tiles::<A>(sums, &none[0], &none[1], gradients);
+        let [packed, colors, opacities] = gradients.each_ref().map(Buffer::arg);
+        let target = SplatTargetLaunch::new(packed, colors, opacities);
+        self.tiles::<A>(sums, TargetArgs::Splats(target));
     }
 
-    fn tiles<A: Numeric>(
-        &self,
-        sums: Sums,
-        slots: &Buffer,
-        slot_gradients: &Buffer,
-        gradients: &[Buffer; 3],
-    ) {
+    fn tiles<A: Numeric>(&self, sums: Sums, target: TargetArgs<A>) {
         let (inputs, state, frames) = (self.inputs, self.state, self.frames);
-        let [grad_packed, grad_colors, grad_opacities] = gradients;
         if state.lists.instances == 0 {
             return;
         }
-        let background = inputs.background.clone();
-        let background = background.unwrap_or_else(|| Buffer::empty(self.client, 1));
         rasterize_backward::launch::<A>(
             self.client,
             cube_count(frames.tiles()),
@@ -477,17 +467,13 @@ impl Launch<'_> {
             inputs.packed.arg(),
             inputs.colors.arg(),
             inputs.opacities.arg(),
-            background.arg(),
+            inputs.background.as_ref().map(Buffer::arg).into(),
             state.lists.splats.arg(),
-            slots.arg(),
             state.lists.ranges.arg(),
             state.transmittance.arg(),
             state.walked.arg(),
             self.grad_output.arg(),
-            slot_gradients.arg(),
-            grad_packed.arg(),
-            grad_colors.arg(),
-            grad_opacities.arg(),
+            target,
             frames.uniforms(),
             thresholds(frames, self.settings),
             inputs.channels as u32,
@@ -495,7 +481,6 @@ impl Launch<'_> {
             self.plan,
             self.layout,
             sums,
-            inputs.background.is_some(),
             self.first_channel == 0,
         );
     }

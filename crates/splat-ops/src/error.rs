@@ -52,6 +52,20 @@ pub enum OpError {
         /// How many of them can be listed.
         limit: u64,
     },
+    /// A kernel needs more buffers than the device lets it have.
+    #[error(
+        "{op}: this device lets a kernel bind {bound} storage buffers (wgpu's limit \
+         `max_storage_buffers_per_shader_stage`, less one for CubeCL), and {needed} are needed. Choose another device, \
+         for instance the CPU"
+    )]
+    TooFewBindings {
+        /// The op.
+        op: &'static str,
+        /// How many a kernel can bind.
+        bound: u32,
+        /// How many the op needs.
+        needed: u32,
+    },
     /// The device failed.
     #[error("{op}: the device failed: {what}")]
     Device {

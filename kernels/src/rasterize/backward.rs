@@ -15,7 +15,7 @@
 use cubecl::prelude::*;
 
 use super::pair::{SHAPE, Shape, Thresholds, UNSEEN, sample};
-use super::sums::{Sums, add_to_splat};
+use super::sums::{Sums, Target, TargetExpand, add_to_splat};
 use super::tile::{BATCH, Batch, Plan, WORDS, pixel_index, place};
 use crate::intersect::Grid;
 
@@ -61,24 +61,20 @@ impl SlotLayout {
     }
 }
 
-/// Gradients of every (tile, splat) pair: one workgroup per tile, back to front. They go to `slot_gradients`, or are added
-/// to the three that follow it, as `sums` says; nothing reads or writes the other, nor, without slots, `slots`.
+/// Gradients of every (tile, splat) pair: one workgroup per tile, back to front. They go to `target`, to splats as `sums`
+/// says.
 #[cube(launch)]
 pub(super) fn rasterize_backward<A: Numeric>(
     packed: &[f32],
     colors: &[f32],
     opacities: &[f32],
-    background: &[f32],
+    background: ComptimeOption<&[f32]>,
     splats: &[u32],
-    slots: &[u32],
     ranges: &[u32],
     transmittance: &[f32],
     walked: &[u32],
     grad_output: &[f32],
-    slot_gradients: &mut [f32],
-    grad_packed: &[Atomic<A>],
-    grad_colors: &[Atomic<A>],
-    grad_opacities: &[Atomic<A>],
+    mut target: Target<A>,
     grid: Grid,
     thresholds: Thresholds,
     channels: u32,
@@ -86,7 +82,6 @@ pub(super) fn rasterize_backward<A: Numeric>(
     #[comptime] plan: Plan,
     #[comptime] layout: SlotLayout,
     #[comptime] sums: Sums,
-    #[comptime] has_background: bool,
     #[comptime] first_launch: bool,
 ) {
     let values = comptime!(layout.values());
@@ -145,7 +140,8 @@ pub(super) fn rasterize_backward<A: Numeric>(
             for channel in 0..width {
                 let value = grad_output[from + channel];
                 g[q * width + channel] = value;
-                if comptime!(has_background) {
+                #[comptime]
+                if let ComptimeOption::Some(background) = &background {
                     let at = (place.camera * channels + first_channel) as usize + channel;
                     seen += value * background[at];
                 }
@@ -173,11 +169,12 @@ pub(super) fn rasterize_backward<A: Numeric>(
             let at = (start + entry) as usize;
             let splat = splats[at] as usize;
             let color = splat * channels as usize + first_channel as usize;
-            targets[k as usize] = if comptime!(sums == Sums::Ordered) {
-                slots[at]
-            } else {
-                splats[at]
+            #[comptime]
+            let to = match &target {
+                Target::Slots(slots) => slots.of[at],
+                Target::Splats(_) => splats[at],
             };
+            targets[k as usize] = to;
             batch.load(
                 packed, colors, opacities, splat, color, k as usize, entry, &ends, grid, place,
                 plan, width,
@@ -287,7 +284,7 @@ pub(super) fn rasterize_backward<A: Numeric>(
             while row < comptime!(group * values) {
                 let k = from as usize + row / values;
                 if k < count as usize {
-                    let target = targets[k] as usize;
+                    let to = targets[k] as usize;
                     let mut touched = batch.touched[k];
                     let walked = touched != 0u32;
                     let mut sum = 0.0f32;
@@ -295,21 +292,25 @@ pub(super) fn rasterize_backward<A: Numeric>(
                         sum += partials[row * blocks + touched.trailing_zeros() as usize];
                         touched &= touched - 1u32;
                     }
-                    if comptime!(sums == Sums::Ordered) {
-                        slot_gradients[target * values + row % values] = sum;
-                    } else if walked {
-                        add_to_splat(
-                            grad_packed,
-                            grad_colors,
-                            grad_opacities,
-                            target,
-                            row % values,
-                            sum,
-                            channels as usize,
-                            first_channel as usize,
-                            layout,
-                            sums,
-                        );
+                    #[comptime]
+                    match &mut target {
+                        Target::Slots(slots) => {
+                            slots.gradients[to * values + row % values] = sum;
+                        }
+                        Target::Splats(gradients) => {
+                            if walked {
+                                add_to_splat(
+                                    gradients,
+                                    to,
+                                    row % values,
+                                    sum,
+                                    channels as usize,
+                                    first_channel as usize,
+                                    layout,
+                                    sums,
+                                );
+                            }
+                        }
                     }
                 }
                 row += units;

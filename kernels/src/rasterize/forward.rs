@@ -18,7 +18,7 @@ pub(super) fn rasterize_forward(
     packed: &[f32],
     colors: &[f32],
     opacities: &[f32],
-    background: &[f32],
+    background: ComptimeOption<&[f32]>,
     splats: &[u32],
     ranges: &[u32],
     output: &mut [f32],
@@ -30,7 +30,6 @@ pub(super) fn rasterize_forward(
     first_channel: u32,
     #[comptime] plan: Plan,
     #[comptime] width: usize,
-    #[comptime] has_background: bool,
     #[comptime] first_launch: bool,
     #[comptime] counting: bool,
 ) {
@@ -173,7 +172,8 @@ pub(super) fn rasterize_forward(
             #[unroll]
             for channel in 0..width {
                 let mut sum = sums[q * width + channel];
-                if comptime!(has_background) {
+                #[comptime]
+                if let ComptimeOption::Some(background) = &background {
                     let at = (place.camera * channels + first_channel) as usize + channel;
                     sum += t[q] * background[at];
                 }

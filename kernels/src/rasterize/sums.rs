@@ -39,6 +39,31 @@ impl Sums {
     }
 }
 
+/// Where the sums of a tile go. Only what it names is bound: devices bind few buffers at once.
+#[derive(CubeType, CubeLaunch)]
+#[allow(dead_code, reason = "the host makes `TargetArgs` of it")]
+pub(super) enum Target<A: Numeric> {
+    /// To slots, for sums in order.
+    Slots(SlotTarget),
+    /// To splats at once.
+    Splats(SplatTarget<A>),
+}
+
+/// The slot of every (tile, splat) pair, and the gradients of all slots.
+#[derive(CubeType, CubeLaunch)]
+pub(super) struct SlotTarget {
+    pub of: Box<[u32]>,
+    pub gradients: Box<[f32]>,
+}
+
+/// The gradients of all splats, to be added to.
+#[derive(CubeType, CubeLaunch)]
+pub(super) struct SplatTarget<A: Numeric> {
+    pub packed: Box<[Atomic<A>]>,
+    pub colors: Box<[Atomic<A>]>,
+    pub opacities: Box<[Atomic<A>]>,
+}
+
 /// Adds `value` to a float that other units add to, in memory that is an atomic float or an atomic integer of its bits.
 ///
 /// Where floats cannot be added: what is there is taken out (zero stays) and put back with more; if something came in
@@ -61,9 +86,7 @@ fn add<A: Numeric>(to: &Atomic<A>, value: f32, #[comptime] sums: Sums) {
 /// Adds one value of a tile's to the gradient of `splat`, where it belongs.
 #[cube]
 pub(super) fn add_to_splat<A: Numeric>(
-    grad_packed: &[Atomic<A>],
-    grad_colors: &[Atomic<A>],
-    grad_opacities: &[Atomic<A>],
+    gradients: &mut SplatTarget<A>,
     splat: usize,
     value: usize,
     sum: f32,
@@ -75,14 +98,14 @@ pub(super) fn add_to_splat<A: Numeric>(
     if value >= comptime!(layout.first_color()) {
         let channel = first_channel + value - comptime!(layout.first_color());
         if comptime!(layout.colors) {
-            add(&grad_colors[splat * channels + channel], sum, sums);
+            add(&gradients.colors[splat * channels + channel], sum, sums);
         }
     } else if comptime!(layout.shape) {
         if value == 5 {
-            add(&grad_opacities[splat], sum, sums);
+            add(&gradients.opacities[splat], sum, sums);
         } else {
             add(
-                &grad_packed[splat * PACKED + packed_entry(value)],
+                &gradients.packed[splat * PACKED + packed_entry(value)],
                 sum,
                 sums,
             );

@@ -1,15 +1,56 @@
 //! The adapter that tests run on.
 
+use std::sync::OnceLock;
+
 use cubecl::client::Client;
 use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
+use cubecl::future::block_on;
+use cubecl::wgpu::wgpu::{DeviceDescriptor, Features, Limits, MemoryHints};
+use cubecl::wgpu::{
+    AutoGraphicsApi, RuntimeOptions, WgpuDevice, WgpuSetup, try_init_device, try_init_setup,
+};
+use splat_kernels::MOST_BUFFERS;
 
-/// A client of the default wgpu adapter, software ones included; `None`, loudly, where there is none.
+/// A client of the default wgpu adapter, software ones included; `None`, loudly, where there is none. With WGSL it binds
+/// as few buffers as the kernels say they can do with.
 pub fn find() -> Option<Client> {
-    let device = [DefaultDevice, Cpu]
-        .into_iter()
-        .find_map(|kind| cubecl::Device::wgpu(kind).ok());
-    if device.is_none() {
+    // A process can open it once.
+    static CLIENT: OnceLock<Option<Client>> = OnceLock::new();
+    let client = CLIENT.get_or_init(open).clone();
+    if client.is_none() {
         eprintln!("\n*** SKIPPED: no wgpu adapter here, the kernels were NOT tested ***\n");
     }
-    Some(device?.client())
+    client
+}
+
+fn open() -> Option<Client> {
+    let (device, setup) = [DefaultDevice, Cpu].into_iter().find_map(|kind| {
+        let device = WgpuDevice::new(kind);
+        let setup = try_init_setup::<AutoGraphicsApi>(&device, RuntimeOptions::default());
+        Some((device, setup.ok()?))
+    })?;
+    let client = cubecl::Device::Wgpu(device).client();
+    // SPIR-V and MSL need a device that only CubeCL can open.
+    if client.name() != "wgpu<wgsl>" {
+        return Some(client);
+    }
+    Some(cubecl::Device::Wgpu(with_few_bindings(setup)).client())
+}
+
+fn with_few_bindings(mut setup: WgpuSetup) -> WgpuDevice {
+    let request = setup.adapter.request_device(&DeviceDescriptor {
+        required_features: setup
+            .device
+            .features()
+            .difference(Features::all_experimental_mask()),
+        required_limits: Limits {
+            // One is CubeCL's own, for lengths and scalars.
+            max_storage_buffers_per_shader_stage: MOST_BUFFERS + 1,
+            ..setup.device.limits()
+        },
+        memory_hints: MemoryHints::MemoryUsage,
+        ..DeviceDescriptor::default()
+    });
+    (setup.device, setup.queue) = block_on(request).expect("a device within its adapter's limits");
+    try_init_device(setup, RuntimeOptions::default()).expect("a setup of our own")
 }

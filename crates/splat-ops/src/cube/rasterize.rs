@@ -5,12 +5,13 @@ use burn::backend::ops::FloatTensorOps;
 use burn::tensor::{FloatDType, Shape};
 use burn_cubecl::CubeBackend;
 use burn_cubecl::tensor::CubeTensor;
-use splat_kernels::Buffer;
+use cubecl::client::Client;
 use splat_kernels::intersect::{Frames, IntersectError, MAX_INSTANCES};
 use splat_kernels::rasterize::{
     RasterizeInputs, RasterizeSettings, RasterizeState, Sums, count_evaluations, rasterize,
     rasterize_vjp,
 };
+use splat_kernels::{Buffer, MOST_BUFFERS, bindable_buffers};
 
 use super::{buffer, prepare, tensor};
 use crate::OpError;
@@ -86,6 +87,20 @@ fn op_error(error: IntersectError) -> OpError {
     }
 }
 
+/// Of all kernels, those of the rasteriser's gradient bind the most. wgpu would refuse them when they are launched, which
+/// shows when a gradient is read, if it is.
+fn enough_bindings(client: &Client) -> Result<(), OpError> {
+    let (bound, needed) = (bindable_buffers(client), MOST_BUFFERS);
+    if bound >= needed {
+        return Ok(());
+    }
+    Err(OpError::TooFewBindings {
+        op: "rasterize",
+        bound,
+        needed,
+    })
+}
+
 fn zeros(like: &CubeTensor, shape: Shape) -> CubeTensor {
     CubeBackend::float_zeros(shape, &like.device, FloatDType::F32)
 }
@@ -108,15 +123,14 @@ pub(super) fn forward(
         frames.width as usize,
         inputs.channels + 1,
     ]);
-    match rasterize(
-        &prepared.packed.client,
-        &inputs,
-        &frames,
-        &settings(&args.settings),
-    ) {
+    let client = &prepared.packed.client;
+    let rendered = enough_bindings(client).and_then(|()| {
+        rasterize(client, &inputs, &frames, &settings(&args.settings)).map_err(op_error)
+    });
+    match rendered {
         Ok((output, state)) => (tensor(&prepared.packed, output, shape), Some(state)),
         Err(error) => {
-            args.errors.report(op_error(error));
+            args.errors.report(error);
             (zeros(&prepared.packed, shape), None)
         }
     }
@@ -171,7 +185,7 @@ pub(super) fn backward(
 /// `[C, N, D]` and opacities `[C, N]` are measured once, not often.
 #[cfg(feature = "cpu")]
 pub(crate) fn work(
-    client: &cubecl::client::Client,
+    client: &Client,
     projected: &crate::Projected,
     colors: burn::tensor::Tensor<3>,
     opacities: burn::tensor::Tensor<2>,

@@ -5,8 +5,8 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
 use crate::{
-    AdamRows, AdamStep, ImageSize, OpError, ProjectSettings, RasterizeSettings, SsimArgs,
-    adam_step, gaussian_blur, project, rasterize, spherical_harmonics, ssim_map,
+    AdamRows, AdamStep, ImageSize, OpError, ProjectSettings, Projected, RasterizeSettings,
+    SsimArgs, adam_step, gaussian_blur, project, rasterize, spherical_harmonics, ssim_map,
 };
 
 /// Whether there is a wgpu adapter, a software one included.
@@ -380,6 +380,66 @@ fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
     assert!(
         matches!(error, OpError::TooManyPairs { pairs: found, .. } if found == pairs),
         "{error:?}"
+    );
+}
+
+/// A device of wgpu's that has no more of `max_storage_buffers_per_shader_stage` than WebGPU promises.
+fn device_with_webgpu_bindings() -> Option<Device> {
+    use cubecl::wgpu::WgpuSetup;
+    use cubecl::wgpu::wgpu::{DeviceDescriptor, Instance, Limits, RequestAdapterOptions};
+    let instance = Instance::default();
+    let adapter = instance.request_adapter(&RequestAdapterOptions::default());
+    let adapter = cubecl::future::block_on(adapter).ok()?;
+    let limits = Limits {
+        max_storage_buffers_per_shader_stage: 8,
+        ..adapter.limits()
+    };
+    let request = adapter.request_device(&DeviceDescriptor {
+        required_limits: limits,
+        ..DeviceDescriptor::default()
+    });
+    let (device, queue) = cubecl::future::block_on(request).ok()?;
+    let backend = adapter.get_info().backend;
+    let setup = WgpuSetup {
+        instance,
+        adapter,
+        device,
+        queue,
+        backend,
+    };
+    Device::wgpu_options().setup(setup).init().ok()
+}
+
+#[test]
+fn too_few_bindings_of_a_device_are_an_error_that_names_the_limit() {
+    if !has_adapter() {
+        return;
+    }
+    let device = device_with_webgpu_bindings().expect("a poorer device of the same adapter");
+    let row = |values: &[f32]| {
+        let data = TensorData::new(values.to_vec(), [1, values.len()]);
+        Tensor::<2>::from_data(data, &device)
+    };
+    let size = ImageSize {
+        width: 8,
+        height: 8,
+    };
+    let packed = row(&[4.0, 4.0, 1.0, 0.5, 0.0, 0.5, 1.0, 8.0, 8.0]);
+    let projected = Projected::from_packed(packed.unsqueeze(), size).unwrap();
+    let (color, opacity) = (row(&[1.0]), row(&[0.5]).squeeze_dim::<1>(1));
+    let settings = RasterizeSettings::default();
+    let error = rasterize(&projected, color, opacity, None, &settings).unwrap_err();
+    println!("{error}");
+    let expected = OpError::TooFewBindings {
+        op: "rasterize",
+        bound: 7,
+        needed: splat_kernels::MOST_BUFFERS,
+    };
+    assert_eq!(error, expected);
+    assert!(
+        error
+            .to_string()
+            .contains("max_storage_buffers_per_shader_stage")
     );
 }
 

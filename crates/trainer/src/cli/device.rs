@@ -65,7 +65,24 @@ pub(super) fn open(global: &GlobalArgs) -> Result<ChosenDevice, Failure> {
             .or_else(|()| cpu().or_else(|_| wgpu("wgpu"))),
     }?;
     global.say(format_args!("device: {}", chosen.in_words()));
+    let facts = describe(&chosen.device).unwrap_or_default();
+    if may_crash(&facts) {
+        global.say(
+            "warning: this program gives SPIR-V to Vulkan (feature `vulkan`), on which older software Vulkan (llvmpipe \
+             of Mesa 22.3 and 25.0) crashes; if it does, take --device cpu, or a program built without that feature",
+        );
+    }
     Ok(chosen)
+}
+
+/// Whether a device is known to crash in its driver, where nothing can be caught: all that helps is to say so before.
+fn may_crash(facts: &[(&'static str, String)]) -> bool {
+    let has = |name, part| {
+        facts
+            .iter()
+            .any(|(n, value)| *n == name && value.contains(part))
+    };
+    has("runtime", "spirv") && has("name", "llvmpipe")
 }
 
 #[cfg(feature = "cpu")]
@@ -131,8 +148,10 @@ fn vulkan() -> Result<ChosenDevice, Failure> {
 fn cuda() -> Result<ChosenDevice, Failure> {
     use burn::tensor::DeviceType;
     let device = Device::enumerate(DeviceType::Cuda).into_iter().next();
-    let none = || Failure::BadInput("--device cuda: no CUDA device was found".to_owned());
-    Ok(named("cuda", device.ok_or_else(none)?))
+    let none = "--device cuda: no CUDA device was found. It takes an NVIDIA GPU and its driver (libcuda); --device wgpu \
+                takes any GPU with Vulkan, Metal or DirectX, --device cpu none";
+    let device = device.ok_or_else(|| Failure::BadInput(none.to_owned()))?;
+    Ok(named("cuda", device))
 }
 
 #[cfg(not(feature = "cuda"))]
@@ -154,4 +173,24 @@ fn not_built(feature: &str) -> Failure {
     Failure::BadInput(format!(
         "--device {feature}: this program was built without it; build with `--features {feature}`"
     ))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::may_crash;
+
+    #[test]
+    fn only_spirv_on_software_vulkan_is_warned_of() {
+        let facts = |name: &str, runtime: &str| {
+            [("name", name.to_owned()), ("runtime", runtime.to_owned())]
+        };
+        let (software, hardware) = (
+            "llvmpipe (LLVM 15.0.6, 256 bits)",
+            "Intel(R) Arc(tm) Graphics",
+        );
+        assert!(may_crash(&facts(software, "wgpu<spirv>")));
+        assert!(!may_crash(&facts(software, "wgpu<wgsl>")));
+        assert!(!may_crash(&facts(hardware, "wgpu<spirv>")));
+        assert!(!may_crash(&[]));
+    }
 }
