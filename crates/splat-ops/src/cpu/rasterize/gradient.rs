@@ -5,6 +5,8 @@
 //! g = d sigma = -raw d alpha = raw (behind - T' (c . grad)) / (1 - alpha)     (0 at the cap)
 //! ```
 //!
+//! T being the transmittance in front of the splat, and T' = (1 - alpha) T that behind it.
+//!
 //! Everything that a splat's shape needs is six sums over its pixels, of g times 1, z1, z2, z1^2, z1 z2 and z2^2. z is of
 //! the order of one wherever the splat is seen, so nothing cancels, however thin or far away it is. With dx = z1 / w11
 //! and dy = (z2 - w21 dx) / w22:
