@@ -8,7 +8,7 @@ use rayon::prelude::*;
 use super::real::Real;
 
 /// Memory for `len` values that are all written before any is read. Tests fill it with NaN first.
-pub(super) fn overwritten<T: Overwritten>(len: usize) -> Vec<T> {
+pub(super) fn overwritten<T: Overwritten + bytemuck::Pod>(len: usize) -> Vec<T> {
     #[cfg(test)]
     if super::poison::is_on() {
         return vec![T::POISON; len];
@@ -17,7 +17,7 @@ pub(super) fn overwritten<T: Overwritten>(len: usize) -> Vec<T> {
 }
 
 /// Zeros, written by all threads where they are many: a step asks for more than one thread clears in the meantime.
-pub(super) fn zeros<T: Overwritten>(len: usize) -> Vec<T> {
+pub(super) fn zeros<T: Overwritten + bytemuck::Pod>(len: usize) -> Vec<T> {
     const BLOCK: usize = 1024;
     if len < 64 * BLOCK {
         return vec![T::CLEAR; len];
@@ -30,7 +30,7 @@ pub(super) fn zeros<T: Overwritten>(len: usize) -> Vec<T> {
 }
 
 /// What [`overwritten`] memory holds before it is written.
-pub(crate) trait Overwritten: bytemuck::Pod + Send + Sync {
+pub(crate) trait Overwritten: Copy + Send + Sync {
     /// Zero.
     const CLEAR: Self;
     /// NaN, or for an index one far outside of any list.

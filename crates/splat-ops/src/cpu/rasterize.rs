@@ -37,8 +37,7 @@ use crate::settings::RasterizeArgs;
 use batch::Reached;
 use blend::BlendTile;
 use gradient::{GradientTile, MOMENTS, Upstream};
-use splat::Splat;
-
+pub(super) use splat::{NUMBERS, Splat};
 pub use work::{RasterizeWork, rasterize_work};
 
 /// So many partial gradients before its turn one is fetched.
@@ -76,9 +75,8 @@ struct Listed<T> {
 impl<T: Real> Listed<T> {
     fn new(camera: &Camera<T>, args: &RasterizeArgs) -> Result<Self, OpError> {
         let _span = trace_span!("rasterize lists").entered();
-        let (lists, footprints) =
-            TileLists::new(camera.packed, camera.colors, camera.opacities, args)?;
-        let splats = footprints.par_iter().with_min_len(CHUNK).map(Splat::new);
+        let inputs = [camera.packed, camera.colors, camera.opacities];
+        let (lists, splats) = TileLists::new(inputs, args)?;
         let d = camera.channels;
         let mut colors = Uncleared::<T>::new(lists.listed.len() * d);
         colors
@@ -92,8 +90,8 @@ impl<T: Real> Listed<T> {
                 }
             });
         Ok(Self {
-            splats: splats.collect(),
             lists,
+            splats,
             colors: colors.written(),
             channels: d,
         })
@@ -101,15 +99,13 @@ impl<T: Real> Listed<T> {
 
     /// Sums a splat's partial gradients over its tiles, in the order in which these were emitted.
     fn sum(&self, splat: usize, partials: &[T], sums: &mut [T]) {
-        let TileLists {
-            emitted, position, ..
-        } = &self.lists;
         sums.fill(T::ZERO);
-        for i in emitted[splat] as usize..emitted[splat + 1] as usize {
-            // They lie anywhere; those of the next splats follow in `position`.
-            let next = position.get(i + AHEAD);
-            prefetch(partials, next.map(|next| *next as usize * sums.len()));
-            let row = &partials[position[i] as usize * sums.len()..][..sums.len()];
+        for i in self.lists.emitted(splat) {
+            // They lie anywhere; those of the next splats follow.
+            let next = self.lists.place(i + AHEAD);
+            prefetch(partials, next.map(|next| next * sums.len()));
+            let place = self.lists.place(i).unwrap_or_default();
+            let row = &partials[place * sums.len()..][..sums.len()];
             for (sum, value) in sums.iter_mut().zip(row) {
                 *sum += *value;
             }

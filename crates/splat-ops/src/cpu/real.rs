@@ -45,7 +45,10 @@ pub(crate) trait Real:
     fn wide(self) -> f64;
     /// `level / 255`.
     fn of_level(level: u8) -> Self;
+    /// A whole number below 2^24.
+    fn of_index(index: i32) -> Self;
     fn sqrt(self) -> Self;
+    /// The natural logarithm of a normal number above zero, to 3e-7 of itself or of one, whichever is more.
     fn ln(self) -> Self;
     fn abs(self) -> Self;
     fn is_finite(self) -> bool;
@@ -102,6 +105,10 @@ impl Real for f64 {
     #[inline(always)]
     fn of_level(level: u8) -> Self {
         f64::from(level) / 255.0
+    }
+    #[inline(always)]
+    fn of_index(index: i32) -> Self {
+        f64::from(index)
     }
     #[inline(always)]
     fn sqrt(self) -> Self {
@@ -166,11 +173,16 @@ impl Real for f32 {
         f32::from(level) / 255.0
     }
     #[inline(always)]
+    fn of_index(index: i32) -> Self {
+        index as f32
+    }
+    #[inline(always)]
     fn sqrt(self) -> Self {
         self.sqrt()
     }
+    #[inline(always)]
     fn ln(self) -> Self {
-        self.ln()
+        ln_f32(self)
     }
     #[inline(always)]
     fn abs(self) -> Self {
@@ -264,6 +276,19 @@ fn exp_f32<const FMA: bool>(x: f32) -> f32 {
     p * two_to(half) * two_to(n.wrapping_sub(half))
 }
 
+/// `ln(2^n m) = n ln(2) + ln(m)` with m between the square roots of 1/2 and 2, and `ln(m) = 2 artanh(s)` as a series in
+/// `s = (m - 1) / (m + 1)`.
+#[inline(always)]
+fn ln_f32(x: f32) -> f32 {
+    const ROOT_HALF: u32 = core::f32::consts::FRAC_1_SQRT_2.to_bits();
+    let n = (x.to_bits().wrapping_sub(ROOT_HALF) as i32) >> 23;
+    let m = f32::from_bits(x.to_bits().wrapping_sub((n << 23) as u32));
+    let s = (m - 1.0) / (m + 1.0);
+    let t = s * s;
+    let series = 2.0 + t * (2.0 / 3.0 + t * (2.0 / 5.0 + t * (2.0 / 7.0)));
+    n as f32 * core::f32::consts::LN_2 + s * series
+}
+
 /// `2^n` of a small n: moved into the exponent.
 #[inline(always)]
 fn two_to(n: i32) -> f32 {
@@ -318,6 +343,19 @@ mod tests {
             assert_eq!(<f32 as Real>::exp::<FMA>(x), f32::INFINITY, "{x}");
         }
         assert!(<f32 as Real>::exp::<FMA>(f32::NAN).is_nan());
+    }
+
+    #[test]
+    fn ln_is_exact_to_seven_digits() {
+        let mut worst = 0.0f64;
+        for bits in (1.0f32.to_bits()..1e6f32.to_bits()).step_by(61) {
+            for x in [f32::from_bits(bits), 1.0 / f32::from_bits(bits)] {
+                let exact = f64::from(x).ln();
+                worst = worst.max((f64::from(Real::ln(x)) - exact).abs() / exact.abs().max(1.0));
+            }
+        }
+        println!("worst error {worst:e}");
+        assert!(worst < 3e-7, "worst error {worst:e}");
     }
 
     #[test]

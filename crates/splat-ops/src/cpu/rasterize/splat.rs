@@ -1,6 +1,7 @@
 //! A splat as the pixels of a tile see it, and what becomes of a (pixel, splat) pair.
 
-use super::super::intersect::{Footprint, TILE};
+use super::super::buffer::Overwritten;
+use super::super::intersect::TILE;
 use super::super::real::Real;
 use super::gradient::MOMENTS;
 use crate::settings::RasterizeArgs;
@@ -39,16 +40,20 @@ pub(super) const AHEAD: usize = 12;
 /// `sqrt(log2(e) / 2)`.
 const UNIT: f64 = 0.849_321_800_288_019_1;
 
-/// What the inner loops need of a splat.
+/// How many numbers a splat has.
+pub(in crate::cpu) const NUMBERS: usize = 11;
+
+/// What the inner loops need of a splat. Its ellipse is the part of it that can pass the `alpha_min` test: `sigma <= cut`,
+/// cut being `ln(opacity / alpha_min)`, widened by a little so that rounding never drops a pixel.
 #[derive(Debug, Clone, Copy, Default)]
-pub(super) struct Splat<T> {
-    pub(super) mean: [T; 2],
+pub(in crate::cpu) struct Splat<T> {
+    pub(in crate::cpu) mean: [T; 2],
     /// [`UNIT`] times the inverse Cholesky factor.
     w11: T,
     w21: T,
     w22: T,
     opacity: T,
-    /// `sigma <= cut` along a row at dy is `|dx - slope dy| <= sqrt(reach - shrink dy^2) inverse_a`.
+    /// Along a row at dy the ellipse is `|dx - slope dy| <= sqrt(reach - shrink dy^2) inverse_a`.
     slope: T,
     reach: T,
     shrink: T,
@@ -57,21 +62,100 @@ pub(super) struct Splat<T> {
     end: T,
 }
 
-impl<T: Real> Splat<T> {
-    pub(super) fn new(footprint: &Footprint<T>) -> Self {
-        let unit = T::of(UNIT);
+impl<T: Overwritten> Overwritten for Splat<T> {
+    const CLEAR: Self = Self::of_one(T::CLEAR);
+    #[cfg(test)]
+    const POISON: Self = Self::of_one(T::POISON);
+}
+
+impl<T: Copy> Splat<T> {
+    const fn of_one(number: T) -> Self {
+        Self::from_numbers([number; NUMBERS])
+    }
+
+    #[inline(always)]
+    pub(in crate::cpu) const fn from_numbers(
+        [
+            x,
+            y,
+            w11,
+            w21,
+            w22,
+            opacity,
+            slope,
+            reach,
+            shrink,
+            inverse_a,
+            end,
+        ]: [T; NUMBERS],
+    ) -> Self {
         Self {
-            mean: footprint.mean,
-            w11: footprint.w11 * unit,
-            w21: footprint.w21 * unit,
-            w22: footprint.w22 * unit,
-            opacity: footprint.opacity,
-            slope: footprint.slope,
-            reach: footprint.reach,
-            shrink: footprint.shrink,
-            inverse_a: footprint.inverse_a,
-            end: footprint.end(),
+            mean: [x, y],
+            w11,
+            w21,
+            w22,
+            opacity,
+            slope,
+            reach,
+            shrink,
+            inverse_a,
+            end,
         }
+    }
+
+    #[inline(always)]
+    pub(in crate::cpu) fn into_numbers(self) -> [T; NUMBERS] {
+        let Self {
+            mean: [x, y],
+            w11,
+            w21,
+            w22,
+            opacity,
+            slope,
+            reach,
+            shrink,
+            inverse_a,
+            end,
+        } = self;
+        [
+            x, y, w11, w21, w22, opacity, slope, reach, shrink, inverse_a, end,
+        ]
+    }
+}
+
+impl<T: Real> Splat<T> {
+    /// From screen mean, inverse Cholesky factor and opacity; and half the height of its ellipse.
+    #[inline(always)]
+    pub(in crate::cpu) fn new([x, y, w11, w21, w22, opacity]: [T; 6], alpha_min: T) -> (Self, T) {
+        let cut = (opacity / alpha_min).ln();
+        let cut = cut + T::of(1e-4) * (cut + T::ONE);
+        // L = W^-1 has l11 = 1/w11, l21 = -w21/(w11 w22), l22 = 1/w22; covariance = L L^T.
+        let (radius, a) = ((cut + cut).sqrt(), w11 * w11 + w21 * w21);
+        let unit = T::of(UNIT);
+        let splat = Self {
+            mean: [x, y],
+            w11: w11 * unit,
+            w21: w21 * unit,
+            w22: w22 * unit,
+            opacity,
+            slope: -w21 * w22 / a,
+            reach: (cut + cut) * a,
+            shrink: w11 * w22 * w11 * w22,
+            inverse_a: T::ONE / a,
+            // Where z2 = 0.
+            end: -w21 / w22 * (radius / w11),
+        };
+        (splat, radius * a.sqrt() / (w11 * w22))
+    }
+
+    /// Where between two rows the ellipse lies farthest right, or with a sign of -1 left, and whether it lies there at
+    /// all. All seen from its mean.
+    #[inline(always)]
+    pub(in crate::cpu) fn farthest(&self, sign: T, [first, last]: [T; 2]) -> (T, bool) {
+        let dy = (sign * self.end).greatest(first).least(last);
+        let discriminant = self.reach - self.shrink * dy * dy;
+        let half = discriminant.greatest(T::ZERO).sqrt() * self.inverse_a;
+        (self.slope * dy + sign * half, discriminant >= T::ZERO)
     }
 
     /// The blocks of the tile that the ellipse reaches, a bit for each: in each row of blocks those from where it lies
@@ -88,17 +172,11 @@ impl<T: Real> Splat<T> {
             let sign = if i < ACROSS { -T::ONE } else { T::ONE };
             let first = T::of((i % ACROSS * SIDE) as f64 + 0.5);
             let last = first + to_pixel + to_pixel;
-            let dy = (sign * self.end).greatest(top + first - self.mean[1]);
-            let dy = dy.least(top + last - self.mean[1]);
-            let discriminant = self.reach - self.shrink * dy * dy;
-            let half = discriminant.greatest(T::ZERO).sqrt() * self.inverse_a;
-            let end = corner + self.slope * dy + sign * (half + slack + to_pixel);
+            let rows = [first, last].map(|row| top + row - self.mean[1]);
+            let (end, is_there) = self.farthest(sign, rows);
+            let end = corner + end + sign * (slack + to_pixel);
             let end = (end * side).greatest(T::ZERO).least(T::of(ACROSS as f64));
-            let end = if discriminant >= T::ZERO {
-                end
-            } else {
-                T::ZERO
-            };
+            let end = if is_there { end } else { T::ZERO };
             ends[i] = 1 << (end.nearest() & 7);
         }
         let mut blocks = 0;
