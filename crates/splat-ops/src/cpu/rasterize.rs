@@ -34,7 +34,7 @@ use super::simd::{prefetch, vectorized};
 use crate::OpError;
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::RasterizeArgs;
-use batch::Reached;
+use batch::{GROUP, Reached, by_groups};
 use blend::BlendTile;
 use gradient::{GradientTile, MOMENTS, Upstream};
 pub(super) use splat::{NUMBERS, Splat};
@@ -97,19 +97,35 @@ impl<T: Real> Listed<T> {
         })
     }
 
-    /// Sums a splat's partial gradients over its tiles, in the order in which these were emitted.
-    fn sum(&self, splat: usize, partials: &[T], sums: &mut [T]) {
-        sums.fill(T::ZERO);
+    /// Sums some of a splat's partial gradients over its tiles, in the order in which these were emitted.
+    #[inline(always)]
+    fn sum<const COUNT: usize>(&self, splat: usize, partials: &[T], first: usize) -> [T; COUNT] {
+        let width = MOMENTS + self.channels;
+        let mut sums = [T::ZERO; COUNT];
         for i in self.lists.emitted(splat) {
             // They lie anywhere; those of the next splats follow.
             let next = self.lists.place(i + AHEAD);
-            prefetch(partials, next.map(|next| next * sums.len()));
+            prefetch(partials, next.map(|next| next * width + first));
             let place = self.lists.place(i).unwrap_or_default();
-            let row = &partials[place * sums.len()..][..sums.len()];
-            for (sum, value) in sums.iter_mut().zip(row) {
-                *sum += *value;
+            let row = &partials[place * width + first..][..COUNT];
+            for i in 0..COUNT {
+                sums[i] += row[i];
             }
         }
+        sums
+    }
+
+    /// Of a few channels.
+    #[inline(always)]
+    fn sum_colors<const COUNT: usize>(
+        &self,
+        first: usize,
+        splat: usize,
+        partials: &[T],
+        sums: &mut [T],
+    ) {
+        let of_channels = self.sum::<COUNT>(splat, partials, MOMENTS + first);
+        sums[first..first + COUNT].copy_from_slice(&of_channels);
     }
 }
 
@@ -423,18 +439,16 @@ impl<T: Real> GradientRows<'_, T> {
             [self.packed, self.colors, self.opacities].map(Part::cleared);
         let listed = &frame.lists.listed;
         let at = |n: usize| listed.partition_point(|listed| (*listed as usize) < n);
-        let mut sums = vec![T::ZERO; MOMENTS + d];
         for splat in at(self.first)..at(self.first + opacities.len()) {
-            frame.sum(splat, partials, &mut sums);
-            let (moments, of_color) = sums.split_at(MOMENTS);
-            let moments = core::array::from_fn(|i| moments[i]);
+            let moments = frame.sum(splat, partials, 0);
             let (geometry, of_opacity) = frame.splats[splat].gradients(moments);
             let row = listed[splat] as usize - self.first;
             let packed = &mut packed[row * PROJECTED_WIDTH..][..PROJECTED_WIDTH];
             packed[..2].copy_from_slice(&geometry[..2]);
             packed[3..6].copy_from_slice(&geometry[2..]);
-            colors[row * d..][..d].copy_from_slice(of_color);
             opacities[row] = of_opacity;
+            let colors = &mut colors[row * d..][..d];
+            by_groups!(frame.sum_colors(d, splat, partials, colors));
         }
     }
 

@@ -70,10 +70,13 @@ impl<'a, T: Real> Inputs<'a, T> {
         self.means.len() / 3
     }
 
-    /// Coefficients of one Gaussian that the degree reads, without the first.
-    fn rest(&self, n: usize) -> &'a [T] {
-        let used = sh_coefficient_count(self.degree) - 1;
-        &self.rest[3 * self.stored * n..][..3 * used]
+    /// Some coefficients of one Gaussian, from the one after the first.
+    #[inline(always)]
+    fn rest<const REST: usize>(&self, n: usize) -> [Vec3<T>; REST] {
+        let (rest, _) = self.rest[3 * self.stored * n..].as_chunks::<3>();
+        let mut coefficients = [[T::ZERO; 3]; REST];
+        coefficients.copy_from_slice(&rest[..REST]);
+        coefficients
     }
 
     fn sh0(&self, n: usize) -> &'a [T] {
@@ -92,20 +95,66 @@ impl<'a, T: Real> Inputs<'a, T> {
         columns
     }
 
-    /// The colour before the clamp, given the basis in the direction of the Gaussian.
+    /// The colour of a Gaussian before the clamp, given the basis in its direction in one of the lanes.
     #[inline(always)]
-    fn color(&self, n: usize, basis: &[Lanes<T>; COUNT_MAX], lane: usize) -> Vec3<T> {
+    fn color<const REST: usize>(
+        &self,
+        n: usize,
+        basis: &[Lanes<T>; COUNT_MAX],
+        lane: usize,
+    ) -> Vec3<T> {
         let sh0 = self.sh0(n);
         let first = basis[0][lane];
         let mut color = [first * sh0[0], first * sh0[1], first * sh0[2]];
-        for (coeff, basis) in self.rest(n).chunks_exact(3).zip(&basis[1..]) {
-            let value = basis[lane];
+        for (i, coeff) in self.rest::<REST>(n).iter().enumerate() {
+            let value = basis[1 + i][lane];
             color[0] += value * coeff[0];
             color[1] += value * coeff[1];
             color[2] += value * coeff[2];
         }
         let half = T::of(0.5);
         [color[0] + half, color[1] + half, color[2] + half]
+    }
+}
+
+/// Calls a function for the number of coefficients beyond the first that the degree reads, which the compiler then knows:
+/// `function::<.., COUNT>(...)`.
+macro_rules! by_degree {
+    ($degree:expr, $function:ident::<$($generic:ident),+>($($argument:expr),* $(,)?)) => {
+        match $degree {
+            0 => $function::<$($generic,)+ 0>($($argument),*),
+            1 => $function::<$($generic,)+ { sh_coefficient_count(1) - 1 }>($($argument),*),
+            2 => $function::<$($generic,)+ { sh_coefficient_count(2) - 1 }>($($argument),*),
+            _ => $function::<$($generic,)+ { sh_coefficient_count(SH_DEGREE_MAX) - 1 }>($($argument),*),
+        }
+    };
+}
+
+vectorized! {
+    /// The colours of Gaussians that lie side by side, given the basis in their directions.
+    fn colors_of_rows<T: Real, const FMA: bool>(
+        inputs: &Inputs<T>,
+        first: usize,
+        basis: &[Lanes<T>; COUNT_MAX],
+        colors: &mut [T],
+    ) {
+        by_degree!(inputs.degree, colors_of_degree::<T>(inputs, first, basis, colors));
+    }
+}
+
+#[inline(always)]
+fn colors_of_degree<T: Real, const REST: usize>(
+    inputs: &Inputs<T>,
+    first: usize,
+    basis: &[Lanes<T>; COUNT_MAX],
+    colors: &mut [T],
+) {
+    for (lane, out) in colors.chunks_exact_mut(3).enumerate() {
+        let color = inputs.color::<REST>(first + lane, basis, lane % LANES);
+        for (out, value) in out.iter_mut().zip(color) {
+            // NaN stays.
+            *out = if value < T::ZERO { T::ZERO } else { value };
+        }
     }
 }
 
@@ -204,17 +253,11 @@ pub(super) fn forward<T: Real>(
         let blocks = part.overwritten().chunks_mut(3 * LANES);
         for (first, colors) in (first / 3..).step_by(LANES).zip(blocks) {
             let rows = first..first + colors.len() / 3;
-            let directions = inputs.directions(rows.clone(), center);
+            let directions = inputs.directions(rows, center);
             let mut units = [[T::ZERO; LANES]; 4];
             let mut basis = [[T::ZERO; LANES]; COUNT_MAX];
             evaluate(degree, &directions, &mut units, &mut basis);
-            for (lane, (n, out)) in rows.zip(colors.chunks_exact_mut(3)).enumerate() {
-                let color = inputs.color(n, &basis, lane);
-                for (out, value) in out.iter_mut().zip(color) {
-                    // NaN stays.
-                    *out = if value < T::ZERO { T::ZERO } else { value };
-                }
-            }
+            colors_of_rows(&inputs, first, &basis, colors);
         }
     });
     tensor(colors.written(), [c, n, 3])
@@ -255,22 +298,7 @@ impl<T: Real> Chunk<'_, T> {
         evaluate(inputs.degree, &directions, &mut units, &mut basis);
 
         let mut weights = [[T::ZERO; LANES]; COUNT_MAX];
-        for (lane, n) in rows.iter().enumerate() {
-            let color = inputs.color(*n, &basis, lane);
-            let mut grad = [grad[3 * n], grad[3 * n + 1], grad[3 * n + 2]];
-            for (grad, color) in grad.iter_mut().zip(color) {
-                if color < T::ZERO {
-                    *grad = T::ZERO;
-                }
-            }
-            self.add_coefficients(*n, inputs, &basis, lane, grad);
-            if self.directions {
-                let coeffs = inputs.rest(*n).chunks_exact(3);
-                for (weight, coeff) in weights[1..].iter_mut().zip(coeffs) {
-                    weight[lane] = guarded_dot(grad, coeff);
-                }
-            }
-        }
+        add_to_rows(self, rows, inputs, &basis, grad, &mut weights);
         if !self.directions {
             return;
         }
@@ -288,34 +316,65 @@ impl<T: Real> Chunk<'_, T> {
             }
         }
     }
+}
 
-    /// A coefficient's gradient is its basis function times the colour's.
-    #[inline(always)]
-    fn add_coefficients(
-        &mut self,
-        n: usize,
+vectorized! {
+    /// Adds the gradients of the coefficients of up to [`LANES`] Gaussians, given the basis in their directions and the
+    /// gradients of all colours; and writes those of the basis functions.
+    fn add_to_rows<T: Real, const FMA: bool>(
+        chunk: &mut Chunk<T>,
+        rows: &[usize],
         inputs: &Inputs<T>,
         basis: &[Lanes<T>; COUNT_MAX],
-        lane: usize,
-        grad: Vec3<T>,
+        grad: &[T],
+        weights: &mut [Lanes<T>; COUNT_MAX],
     ) {
-        let i = n - self.rows.start;
-        if !self.sh0.is_empty() {
-            let sh0 = &mut self.sh0[3 * i..3 * i + 3];
-            for (sum, grad) in sh0.iter_mut().zip(grad) {
-                *sum += basis[0][lane] * grad;
+        by_degree!(inputs.degree, add_to_degree::<T>(chunk, rows, inputs, basis, grad, weights));
+    }
+}
+
+#[inline(always)]
+fn add_to_degree<T: Real, const REST: usize>(
+    chunk: &mut Chunk<T>,
+    rows: &[usize],
+    inputs: &Inputs<T>,
+    basis: &[Lanes<T>; COUNT_MAX],
+    grad: &[T],
+    weights: &mut [Lanes<T>; COUNT_MAX],
+) {
+    for (lane, n) in rows.iter().enumerate() {
+        let lane = lane % LANES;
+        let color = inputs.color::<REST>(*n, basis, lane);
+        let mut grad = [grad[3 * n], grad[3 * n + 1], grad[3 * n + 2]];
+        for (grad, color) in grad.iter_mut().zip(color) {
+            if color < T::ZERO {
+                *grad = T::ZERO;
             }
         }
-        if !self.rest.is_empty() {
-            let used = inputs.rest(n).len();
-            let rest = &mut self.rest[3 * inputs.stored * i..][..used];
+        // A coefficient's gradient is its basis function times the colour's.
+        let i = n - chunk.rows.start;
+        if !chunk.sh0.is_empty() {
+            add_scaled(&mut chunk.sh0[3 * i..3 * i + 3], basis[0][lane], grad);
+        }
+        if !chunk.rest.is_empty() {
+            let rest = &mut chunk.rest[3 * inputs.stored * i..][..3 * REST];
             for (sums, basis) in rest.chunks_exact_mut(3).zip(&basis[1..]) {
-                let value = basis[lane];
-                sums[0] += value * grad[0];
-                sums[1] += value * grad[1];
-                sums[2] += value * grad[2];
+                add_scaled(sums, basis[lane], grad);
             }
         }
+        if chunk.directions {
+            for (weight, coeff) in weights[1..].iter_mut().zip(inputs.rest::<REST>(*n)) {
+                weight[lane] = guarded_dot(grad, coeff);
+            }
+        }
+    }
+}
+
+/// `sums += scale values`.
+#[inline(always)]
+fn add_scaled<T: Real>(sums: &mut [T], scale: T, values: Vec3<T>) {
+    for (sum, value) in sums.iter_mut().zip(values) {
+        *sum += scale * value;
     }
 }
 

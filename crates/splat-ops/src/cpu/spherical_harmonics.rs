@@ -168,15 +168,13 @@ pub(super) fn is_zero<T: Real>(grad: &[T]) -> bool {
 
 /// `grad . coeff`, where a channel without gradient (black, and clamped there) does not look at its coefficient, which
 /// may be infinite.
+// Every product is computed, so that no branch is needed.
 #[inline(always)]
-pub(super) fn guarded_dot<T: Real>(grad: Vec3<T>, coeff: &[T]) -> T {
+pub(super) fn guarded_dot<T: Real>(grad: Vec3<T>, coeff: Vec3<T>) -> T {
     let mut sum = T::ZERO;
-    for (grad, coeff) in grad.into_iter().zip(coeff) {
-        sum += if grad == T::ZERO {
-            T::ZERO
-        } else {
-            grad * *coeff
-        };
+    for i in 0..3 {
+        let product = grad[i] * coeff[i];
+        sum += if grad[i] == T::ZERO { T::ZERO } else { product };
     }
     sum
 }
@@ -239,7 +237,7 @@ pub(super) fn backward<T: Real>(
                 let mut sum = [T::ZERO; 3];
                 for (coeff, derivative) in coeffs.chunks_exact(3).zip(basis_gradient(degree, unit))
                 {
-                    let weight = guarded_dot(grad, coeff);
+                    let weight = guarded_dot(grad, [coeff[0], coeff[1], coeff[2]]);
                     for (sum, derivative) in sum.iter_mut().zip(derivative) {
                         *sum += weight * derivative;
                     }
