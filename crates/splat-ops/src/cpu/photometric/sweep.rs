@@ -22,7 +22,7 @@ use crate::cpu::real::Real;
 use crate::ssim::{SsimArgs, counted};
 
 /// Most pixels of a strip: its rings stay in a core's second-level cache.
-const STRIP: usize = 256;
+const STRIP: usize = 320;
 /// mx, my, q, p.
 pub(super) const MOMENTS: usize = 4;
 /// Derivatives by mx, q, p, all but the second halved.

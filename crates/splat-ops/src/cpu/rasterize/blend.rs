@@ -267,22 +267,30 @@ impl<T: Real> BlendTile<T> {
         channels: usize,
         width: usize,
     ) {
-        let (left, stop) = (self.transmittance[block].0, self.stop[block].0);
-        let (pixels, lanes) = (pixel..pixel + width, lane..lane + width);
-        slab.transmittance[pixels.clone()].copy_from_slice(&left[lanes.clone()]);
-        slab.stop[pixels].copy_from_slice(&stop[lanes]);
+        let row = lane / SIDE;
+        let left = in_row(&self.transmittance[block].0, row);
+        let pixels = pixel..pixel + width;
+        slab.transmittance[pixels.clone()].copy_from_slice(&left[..width]);
+        slab.stop[pixels].copy_from_slice(&in_row(&self.stop[block].0, row)[..width]);
         let image = &mut slab.image[pixel * (channels + 1)..][..width * (channels + 1)];
         for channel in 0..channels {
             let behind = view.background.map_or(T::ZERO, |b| b[channel]);
-            let colors = self.colors[block * channels + channel].0;
+            let colors = in_row(&self.colors[block * channels + channel].0, row);
             for i in 0..width {
-                image[i * (channels + 1) + channel] = colors[lane + i] + left[lane + i] * behind;
+                image[i * (channels + 1) + channel] = colors[i] + left[i] * behind;
             }
         }
         for i in 0..width {
-            image[i * (channels + 1) + channels] = T::ONE - left[lane + i];
+            image[i * (channels + 1) + channels] = T::ONE - left[i];
         }
     }
+}
+
+/// The lanes of a row of a block, and no more: a copy of all would be read before it is written.
+#[inline(always)]
+fn in_row<V: Copy>(lanes: &Lanes<V>, row: usize) -> [V; SIDE] {
+    let (rows, _) = lanes.as_chunks::<SIDE>();
+    rows[row]
 }
 
 /// The alpha of a splat at each pixel that takes its light, and the transmittance behind it.
