@@ -70,13 +70,21 @@ impl<'a, T: Real> Inputs<'a, T> {
         self.means.len() / 3
     }
 
-    /// Some coefficients of one Gaussian, from the one after the first.
+    /// Some coefficients of one Gaussian, from the one after the first; each with the number that follows it in memory, or
+    /// zero, as four numbers are read at once.
     #[inline(always)]
-    fn rest<const REST: usize>(&self, n: usize) -> [Vec3<T>; REST] {
-        let (rest, _) = self.rest[3 * self.stored * n..].as_chunks::<3>();
-        let mut coefficients = [[T::ZERO; 3]; REST];
-        coefficients.copy_from_slice(&rest[..REST]);
-        coefficients
+    fn rest<const REST: usize>(&self, n: usize) -> [[T; 4]; REST] {
+        let row = &self.rest[3 * self.stored * n..][..3 * REST];
+        core::array::from_fn(|i| {
+            let number = |j| {
+                if 3 * i + j < 3 * REST {
+                    row[3 * i + j]
+                } else {
+                    T::ZERO
+                }
+            };
+            core::array::from_fn(number)
+        })
     }
 
     fn sh0(&self, n: usize) -> &'a [T] {
@@ -95,25 +103,29 @@ impl<'a, T: Real> Inputs<'a, T> {
         columns
     }
 
-    /// The colour of a Gaussian before the clamp, given the basis in its direction in one of the lanes.
+    /// The colours of some Gaussians before the clamp, given the basis in their directions.
+    // Four numbers each, of which one means nothing: written to memory, all of them have to be computed, side by side.
     #[inline(always)]
-    fn color<const REST: usize>(
+    fn colors<const REST: usize>(
         &self,
-        n: usize,
+        rows: impl Iterator<Item = usize>,
         basis: &[Lanes<T>; COUNT_MAX],
-        lane: usize,
-    ) -> Vec3<T> {
-        let sh0 = self.sh0(n);
-        let first = basis[0][lane];
-        let mut color = [first * sh0[0], first * sh0[1], first * sh0[2]];
-        for (i, coeff) in self.rest::<REST>(n).iter().enumerate() {
-            let value = basis[1 + i][lane];
-            color[0] += value * coeff[0];
-            color[1] += value * coeff[1];
-            color[2] += value * coeff[2];
+    ) -> [[T; 4]; LANES] {
+        let mut colors = [[T::of(0.5); 4]; LANES];
+        for (lane, (n, color)) in rows.zip(&mut colors).enumerate() {
+            let sh0 = self.sh0(n);
+            let first = basis[0][lane];
+            let mut sums = [first * sh0[0], first * sh0[1], first * sh0[2], T::ZERO];
+            for (basis, coeff) in basis[1..].iter().zip(self.rest::<REST>(n)) {
+                for j in 0..4 {
+                    sums[j] += basis[lane] * coeff[j];
+                }
+            }
+            for j in 0..4 {
+                color[j] += sums[j];
+            }
         }
-        let half = T::of(0.5);
-        [color[0] + half, color[1] + half, color[2] + half]
+        colors
     }
 }
 
@@ -149,9 +161,9 @@ fn colors_of_degree<T: Real, const REST: usize>(
     basis: &[Lanes<T>; COUNT_MAX],
     colors: &mut [T],
 ) {
-    for (lane, out) in colors.chunks_exact_mut(3).enumerate() {
-        let color = inputs.color::<REST>(first + lane, basis, lane % LANES);
-        for (out, value) in out.iter_mut().zip(color) {
+    let values = inputs.colors::<REST>(first..first + colors.len() / 3, basis);
+    for (out, values) in colors.chunks_exact_mut(3).zip(values) {
+        for (out, value) in out.iter_mut().zip(values) {
             // NaN stays.
             *out = if value < T::ZERO { T::ZERO } else { value };
         }
@@ -271,6 +283,8 @@ struct Chunk<'a, T> {
     means: &'a mut [T],
     /// Whether the means' or the centres' are wanted.
     directions: bool,
+    /// Whether all are zero still.
+    is_clear: bool,
 }
 
 impl<T: Real> Chunk<'_, T> {
@@ -281,6 +295,7 @@ impl<T: Real> Chunk<'_, T> {
         for_each_block(self.rows.clone(), is_graded, |rows| {
             self.add_block(rows, inputs, center, grad, &mut of_center);
         });
+        self.is_clear = false;
         of_center
     }
 
@@ -342,9 +357,8 @@ fn add_to_degree<T: Real, const REST: usize>(
     grad: &[T],
     weights: &mut [Lanes<T>; COUNT_MAX],
 ) {
-    for (lane, n) in rows.iter().enumerate() {
-        let lane = lane % LANES;
-        let color = inputs.color::<REST>(*n, basis, lane);
+    let colors = inputs.colors::<REST>(rows.iter().copied(), basis);
+    for (lane, (n, color)) in rows.iter().zip(colors).enumerate() {
         let mut grad = [grad[3 * n], grad[3 * n + 1], grad[3 * n + 2]];
         for (grad, color) in grad.iter_mut().zip(color) {
             if color < T::ZERO {
@@ -358,16 +372,44 @@ fn add_to_degree<T: Real, const REST: usize>(
         }
         if !chunk.rest.is_empty() {
             let rest = &mut chunk.rest[3 * inputs.stored * i..][..3 * REST];
-            for (sums, basis) in rest.chunks_exact_mut(3).zip(&basis[1..]) {
-                add_scaled(sums, basis[lane], grad);
+            let values = core::array::from_fn(|i| basis[1 + i][lane]);
+            if chunk.is_clear {
+                write_scaled::<T, REST>(rest, values, grad);
+            } else {
+                for (sums, value) in rest.chunks_exact_mut(3).zip(values) {
+                    add_scaled(sums, value, grad);
+                }
             }
         }
         if chunk.directions {
-            for (weight, coeff) in weights[1..].iter_mut().zip(inputs.rest::<REST>(*n)) {
-                weight[lane] = guarded_dot(grad, coeff);
+            let rest = inputs.rest::<REST>(*n);
+            let rest = rest.map(|[red, green, blue, _]| [red, green, blue]);
+            let weights = weights[1..].iter_mut().zip(rest);
+            // Most channels have a gradient.
+            if grad.iter().any(|grad| *grad == T::ZERO) {
+                weights.for_each(|(weight, coeff)| weight[lane] = guarded_dot(grad, coeff));
+            } else {
+                weights.for_each(|(weight, coeff)| weight[lane] = dot(grad, coeff));
             }
         }
     }
+}
+
+/// `out = scale values` for one scale after the other. Four numbers are written at once: the last one is overwritten by the
+/// next three.
+#[inline(always)]
+fn write_scaled<T: Real, const COUNT: usize>(
+    out: &mut [T],
+    scales: [T; COUNT],
+    [x, y, z]: Vec3<T>,
+) {
+    let Some((last, scales)) = scales.split_last() else {
+        return;
+    };
+    for (i, scale) in scales.iter().enumerate() {
+        out[3 * i..][..4].copy_from_slice(&[x, y, z, T::ZERO].map(|value| *scale * value));
+    }
+    out[3 * scales.len()..][..3].copy_from_slice(&[x, y, z].map(|value| *last * value));
 }
 
 /// `sums += scale values`.
@@ -410,6 +452,7 @@ pub(super) fn backward<T: Real>(
                 rest,
                 means,
                 directions: wanted[2] || wanted[3],
+                is_clear: true,
             };
             let views = inputs.centers.chunks_exact(3).zip(grad.chunks_exact(3 * n));
             views

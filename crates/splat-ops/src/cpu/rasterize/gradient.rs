@@ -215,11 +215,16 @@ impl<T: Real> GradientTile<T> {
     #[inline(always)]
     fn counts(&self, block: usize, first: i32) -> [usize; 2] {
         let stop = self.stop[block].0;
+        let places = self.batch.places.of(block);
+        let end = first + BATCH as i32;
+        // Most pixels never stop. One loop that always ends, as SIMD code.
+        if stop.iter().fold(true, |all, stop| all & (*stop >= end)) {
+            return [places.len(); 2];
+        }
         let (mut soonest, mut last) = (i32::MAX, 0);
         for stop in stop {
             (soonest, last) = (soonest.min(stop), last.max(stop));
         }
-        let places = self.batch.places.of(block);
         let before = |stop| places.partition_point(|place| first + i32::from(*place) < stop);
         [before(soonest), before(last)]
     }
