@@ -78,8 +78,15 @@ impl<'a, T: Real> Inputs<'a, T> {
             let mean = &self.means[3 * n..3 * n + 3];
             let quat = &self.quats[4 * n..4 * n + 4];
             let scale = &self.scales[3 * n..3 * n + 3];
-            for (column, value) in columns.iter_mut().zip(mean.iter().chain(quat).chain(scale)) {
-                column[lane] = *value;
+            // One after the other, without a loop over chained parts.
+            for (column, value) in columns[..3].iter_mut().zip(mean) {
+                column[lane % LANES] = *value;
+            }
+            for (column, value) in columns[3..7].iter_mut().zip(quat) {
+                column[lane % LANES] = *value;
+            }
+            for (column, value) in columns[7..].iter_mut().zip(scale) {
+                column[lane % LANES] = *value;
             }
         }
         columns
@@ -141,32 +148,58 @@ pub(super) fn forward<T: Real>(
 }
 
 vectorized! {
-    /// Gradients of a block of Gaussians in one camera, and what they add to those of the camera; nothing where culled.
+    /// Gradients of a block of Gaussians in one camera, and what they add to those of the camera, if anybody wants them;
+    /// nothing where culled.
     fn project_lanes_backward<T: Real, const FMA: bool>(
         gaussians: &[Lanes<T>; GAUSSIAN],
         camera: &Camera<T>,
         grad: &[Lanes<T>; GRADED],
         gradients: &mut [Lanes<T>; GAUSSIAN],
-        of_camera: &mut [Lanes<T>; CAMERA],
+        of_camera: Option<&mut [Lanes<T>; CAMERA]>,
     ) {
-        for lane in 0..LANES {
-            let gaussian = gaussian(gaussians, lane);
-            let splat = Splat::new(gaussian, camera);
-            let grad = [
-                grad[0][lane], grad[1][lane], grad[2][lane], grad[3][lane], grad[4][lane], grad[5][lane], grad[6][lane],
-            ];
-            let g = splat_backward(gaussian, camera, &splat, grad);
-            let kept = |value: T| if splat.visible { value } else { T::ZERO };
+        match of_camera {
+            Some(of_camera) => lanes_backward::<T, true>(gaussians, camera, grad, gradients, of_camera),
+            None => {
+                let nowhere = &mut [[T::ZERO; LANES]; CAMERA];
+                lanes_backward::<T, false>(gaussians, camera, grad, gradients, nowhere);
+            }
+        }
+    }
+}
+
+#[inline(always)]
+fn lanes_backward<T: Real, const OF_CAMERA: bool>(
+    gaussians: &[Lanes<T>; GAUSSIAN],
+    camera: &Camera<T>,
+    grad: &[Lanes<T>; GRADED],
+    gradients: &mut [Lanes<T>; GAUSSIAN],
+    of_camera: &mut [Lanes<T>; CAMERA],
+) {
+    for lane in 0..LANES {
+        let gaussian = gaussian(gaussians, lane);
+        let splat = Splat::new(gaussian, camera);
+        let g = splat_backward(
+            gaussian,
+            camera,
+            &splat,
+            core::array::from_fn(|i| grad[i][lane]),
+        );
+        let kept = |value: T| if splat.visible { value } else { T::ZERO };
+        for i in 0..3 {
+            gradients[i][lane] = kept(g.mean[i]);
+            gradients[7 + i][lane] = kept(g.scale[i]);
+        }
+        for i in 0..4 {
+            gradients[3 + i][lane] = kept(g.quat[i]);
+        }
+        if OF_CAMERA {
             for i in 0..3 {
-                gradients[i][lane] = kept(g.mean[i]);
-                gradients[7 + i][lane] = kept(g.scale[i]);
                 for j in 0..3 {
                     of_camera[3 * i + j][lane] += kept(g.w[i][j]);
                 }
                 of_camera[9 + i][lane] += kept(g.t[i]);
             }
             for i in 0..4 {
-                gradients[3 + i][lane] = kept(g.quat[i]);
                 of_camera[12 + i][lane] += kept(g.intrinsics[i]);
             }
         }
@@ -179,6 +212,8 @@ struct Chunk<'a, T> {
     means: &'a mut [T],
     quats: &'a mut [T],
     scales: &'a mut [T],
+    /// Whether the cameras' are wanted too.
+    of_cameras: bool,
 }
 
 impl<T: Real> Chunk<'_, T> {
@@ -188,7 +223,7 @@ impl<T: Real> Chunk<'_, T> {
         // Most splats of most views have none: culled, covered, or too faint.
         let is_graded = |row: usize| {
             let graded = &grad[row * PROJECTED_WIDTH..][..GRADED];
-            graded.iter().any(|g| *g != T::ZERO)
+            graded.iter().fold(false, |any, g| any | (*g != T::ZERO))
         };
         for_each_block(self.rows.clone(), is_graded, |rows| {
             self.add_block(rows, inputs, camera, grad, &mut of_camera);
@@ -212,14 +247,18 @@ impl<T: Real> Chunk<'_, T> {
             }
         }
         let mut gradients = [[T::ZERO; LANES]; GAUSSIAN];
+        let of_camera = self.of_cameras.then_some(of_camera);
         project_lanes_backward(&gaussians, camera, &graded, &mut gradients, of_camera);
         for (lane, row) in rows.iter().enumerate() {
             let i = row - self.rows.start;
-            let mean = self.means[3 * i..3 * i + 3].iter_mut();
-            let quat = &mut self.quats[4 * i..4 * i + 4];
-            let scale = &mut self.scales[3 * i..3 * i + 3];
-            for (sum, column) in mean.chain(quat).chain(scale).zip(&gradients) {
-                *sum += column[lane];
+            for (sums, columns) in [
+                (&mut self.means[3 * i..3 * i + 3], &gradients[..3]),
+                (&mut self.quats[4 * i..4 * i + 4], &gradients[3..7]),
+                (&mut self.scales[3 * i..3 * i + 3], &gradients[7..]),
+            ] {
+                for (sum, column) in sums.iter_mut().zip(columns) {
+                    *sum += column[lane % LANES];
+                }
             }
         }
     }
@@ -251,6 +290,7 @@ pub(super) fn backward<T: Real>(
                 means: means.cleared(),
                 quats: quats.cleared(),
                 scales: scales.cleared(),
+                of_cameras: wanted[3] || wanted[4],
             };
             let views = inputs
                 .cameras

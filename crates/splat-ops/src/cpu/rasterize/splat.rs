@@ -209,14 +209,15 @@ impl<T: Real> Splat<T> {
     /// and z2^2; see the formulas in `gradient.rs`.
     #[inline(always)]
     pub(super) fn gradients(&self, [one, z1, z2, z11, z12, z22]: [T; MOMENTS]) -> ([T; 5], T) {
-        let (unit, square) = (T::of(UNIT), T::of(UNIT * UNIT));
+        let (unit, square) = (T::of(1.0 / UNIT), T::of(1.0 / (UNIT * UNIT)));
         let Self { w11, w21, w22, .. } = *self;
+        let (of_w11, of_w22) = (T::ONE / w11, T::ONE / w22);
         let geometry = [
-            -(w11 * z1 + w21 * z2) / square,
-            -(w22 * z2) / square,
-            z11 / (w11 * unit),
-            z12 / (w11 * unit),
-            (z22 - w21 / w11 * z12) / (w22 * unit),
+            -(w11 * z1 + w21 * z2) * square,
+            -(w22 * z2) * square,
+            z11 * of_w11 * unit,
+            z12 * of_w11 * unit,
+            (z22 - w21 * of_w11 * z12) * of_w22 * unit,
         ];
         (geometry, -one / self.opacity)
     }
