@@ -103,9 +103,13 @@ impl<T: Real> Listed<T> {
         let width = MOMENTS + self.channels;
         let mut sums = [T::ZERO; COUNT];
         for i in self.lists.emitted(splat) {
-            // They lie anywhere; those of the next splats follow.
-            let next = self.lists.place(i + AHEAD);
-            prefetch(partials, next.map(|next| next * width + first));
+            if first == 0 {
+                // They lie anywhere; those of the next splats follow.
+                if let Some(next) = self.lists.place(i + AHEAD) {
+                    prefetch(partials, Some(next * width));
+                    prefetch(partials, Some((next + 1) * width - 1));
+                }
+            }
             let place = self.lists.place(i).unwrap_or_default();
             let row = &partials[place * width + first..][..COUNT];
             for i in 0..COUNT {
