@@ -378,6 +378,38 @@ mod tests {
         }
     }
 
+    #[test]
+    fn what_is_culled_faint_or_not_finite_is_not_visible() {
+        let args = RasterizeArgs {
+            size: ImageSize {
+                width: 3,
+                height: 2,
+            },
+            settings: Default::default(),
+            errors: Default::default(),
+        };
+        let count = 12;
+        let row = [1.0f32, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 3.0, 3.0];
+        let mut packed = vec![row; count];
+        let (mut colors, mut opacities) = (vec![[0.5f32; 2]; count], vec![0.5f32; count]);
+        let all = |packed: &[[f32; 9]], colors: &[[f32; 2]], opacities: &[f32], from: usize| {
+            let inputs = [packed.as_flattened(), colors.as_flattened(), opacities];
+            visible(from..count, inputs, &args)
+        };
+        let expected: Vec<u32> = (0..count as u32).collect();
+        assert_eq!(all(&packed, &colors, &opacities, 0), expected);
+
+        packed[1][7] = 0.0;
+        packed[2][7] = f32::NAN;
+        opacities[4] = 0.003;
+        opacities[5] = f32::NAN;
+        opacities[6] = f32::INFINITY;
+        assert_eq!(all(&packed, &colors, &opacities, 1), [3, 7, 8, 9, 10, 11]);
+        colors[8][1] = f32::NAN;
+        colors[10][0] = f32::NEG_INFINITY;
+        assert_eq!(all(&packed, &colors, &opacities, 0), [0, 3, 7, 9, 11]);
+    }
+
     /// One long splat across a 48 x 48 image, whose bounding box touches all nine tiles.
     fn diagonal(device: &Device) -> (Projected, Tensor<2>, Tensor<1>) {
         let tensor = |values: Vec<f32>, shape: Vec<usize>| TensorData::new(values, shape);
