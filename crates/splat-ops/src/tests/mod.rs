@@ -5,6 +5,7 @@ mod decisions;
 mod photometric;
 mod poison;
 mod probe;
+mod project;
 mod screen_statistics;
 mod sh_colors;
 
