@@ -386,7 +386,7 @@ fn add_to_degree<T: Real, const REST: usize>(
             let rest = rest.map(|[red, green, blue, _]| [red, green, blue]);
             let weights = weights[1..].iter_mut().zip(rest);
             // Most channels have a gradient.
-            if grad.iter().any(|grad| *grad == T::ZERO) {
+            if grad.contains(&T::ZERO) {
                 weights.for_each(|(weight, coeff)| weight[lane] = guarded_dot(grad, coeff));
             } else {
                 weights.for_each(|(weight, coeff)| weight[lane] = dot(grad, coeff));
