@@ -35,7 +35,7 @@ const PARTS: usize = 16;
 /// Pairs of a tile and a splat of one camera that can be listed: they are counted in 32 bits.
 const MAX_PAIRS: u64 = u32::MAX as u64;
 
-/// The one place that decides how many pairs are too many.
+/// The one place that decides how many pairs are too many. Asked before any list is allocated.
 fn check_pairs(pairs: u64, limit: u64) -> Result<(), OpError> {
     if pairs <= limit {
         return Ok(());
@@ -132,28 +132,30 @@ impl TileLists {
             .collect();
         let listed = visible.concat();
 
+        let grid = Grid::new(args);
         let mut splats = Uncleared::<Splat<T>>::new(listed.len());
         let mut depths = Uncleared::<T>::new(listed.len());
+        let mut emitted = |keeps| -> Vec<Emitted> {
+            let emission = Emission::new(packed, opacities, args, keeps);
+            splats
+                .chunks(CHUNK)
+                .into_par_iter()
+                .zip(depths.chunks(CHUNK))
+                .zip(listed.par_chunks(CHUNK))
+                .map(|((splats, depths), listed)| {
+                    let (splats, depths) = (splats.overwritten(), depths.overwritten());
+                    emit(&emission, listed, splats, depths)
+                })
+                .collect()
+        };
+        // Where there may be too many they are counted before any is kept: memory might not hold so many.
         let limit = max_pairs();
-        let emission = Emission::new(packed, opacities, args, limit);
-        let emitted: Vec<Emitted> = splats
-            .chunks(CHUNK)
-            .into_par_iter()
-            .zip(depths.chunks(CHUNK))
-            .zip(listed.par_chunks(CHUNK))
-            .map(|((splats, depths), listed)| {
-                emit(
-                    &emission,
-                    listed,
-                    splats.overwritten(),
-                    depths.overwritten(),
-                )
-            })
-            .collect();
-        check_pairs(emission.pairs(), limit)?;
+        if listed.len() as u64 * grid.tiles() as u64 > limit {
+            check_pairs(emitted(false).iter().map(|part| part.pairs).sum(), limit)?;
+        }
+        let emitted = emitted(true);
 
-        let lists =
-            ByTile::new(&emitted, listed.len(), Grid::new(args)).sorted(listed, &depths.written());
+        let lists = ByTile::new(&emitted, listed.len(), grid).sorted(listed, &depths.written());
         Ok((lists, splats.written()))
     }
 
@@ -316,7 +318,7 @@ struct Piece<'a> {
 impl Piece<'_> {
     /// Puts each instance to the next place of its tile.
     fn place(self, next: &mut [u32], instances: &[AtomicU32]) {
-        let Emitted { tiles, ends } = self.emitted;
+        let Emitted { tiles, ends, .. } = self.emitted;
         // How many splats begin at an instance, and with their sum which splat it is of.
         let owners = self.owners.cleared();
         for ((end, own), splat) in self.ends.overwritten().iter_mut().zip(ends).zip(1..) {
@@ -365,6 +367,17 @@ mod tests {
         LIMIT.get()
     }
 
+    fn small_picture() -> RasterizeArgs {
+        RasterizeArgs {
+            size: ImageSize {
+                width: 3,
+                height: 2,
+            },
+            settings: Default::default(),
+            errors: Default::default(),
+        }
+    }
+
     #[test]
     fn pairs_are_refused_from_the_first_one_that_cannot_be_indexed() {
         for pairs in [0, 1, 1 << 31, MAX_PAIRS] {
@@ -380,14 +393,7 @@ mod tests {
 
     #[test]
     fn what_is_culled_faint_or_not_finite_is_not_visible() {
-        let args = RasterizeArgs {
-            size: ImageSize {
-                width: 3,
-                height: 2,
-            },
-            settings: Default::default(),
-            errors: Default::default(),
-        };
+        let args = small_picture();
         let count = 12;
         let row = [1.0f32, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 3.0, 3.0];
         let mut packed = vec![row; count];
@@ -484,14 +490,7 @@ mod tests {
 
     #[test]
     fn an_image_that_was_not_rendered_is_zero_and_so_are_its_gradients() {
-        let args = RasterizeArgs {
-            size: ImageSize {
-                width: 3,
-                height: 2,
-            },
-            settings: Default::default(),
-            errors: Default::default(),
-        };
+        let args = small_picture();
         let row = vec![1.0f32, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 3.0, 3.0];
         let inputs = || {
             (

@@ -3,8 +3,6 @@
 //! Splats are worked on side by side, as SIMD code. What depends on a splat, how many rows of tiles it reaches and how many
 //! tiles in each, is no branch wherever it can be avoided: it would be guessed wrongly as often as not.
 
-use core::sync::atomic::{AtomicU64, Ordering::Relaxed};
-
 use super::super::rasterize::{NUMBERS, Splat};
 use super::super::real::Real;
 use super::super::simd::{LANES, Lanes, vectorized};
@@ -24,39 +22,34 @@ pub(super) struct Emission<'a, T> {
     opacities: &'a [T],
     alpha_min: T,
     grid: Grid,
-    limit: u64,
-    pairs: AtomicU64,
+    keeps: bool,
 }
 
 /// The tiles of some splats.
 pub(super) struct Emitted {
-    /// One splat's after the other's, row by row. None if there were too many.
+    /// One splat's after the other's, row by row, if they are kept.
     pub(super) tiles: Vec<u32>,
     /// Where each splat's end.
     pub(super) ends: Vec<u32>,
+    /// How many they are, kept or not.
+    pub(super) pairs: u64,
 }
 
 impl<'a, T: Real> Emission<'a, T> {
-    /// No tile is kept once there are more than `limit`.
+    /// Tiles are only counted, or kept too.
     pub(super) fn new(
         packed: &'a [T],
         opacities: &'a [T],
         args: &RasterizeArgs,
-        limit: u64,
+        keeps: bool,
     ) -> Self {
         Self {
             packed,
             opacities,
             alpha_min: T::of(args.settings.alpha_min),
             grid: Grid::new(args),
-            limit,
-            pairs: AtomicU64::new(0),
+            keeps,
         }
-    }
-
-    /// Pairs of a splat and a tile until now.
-    pub(super) fn pairs(&self) -> u64 {
-        self.pairs.load(Relaxed)
     }
 }
 
@@ -71,6 +64,7 @@ vectorized! {
         let mut emitted = Emitted {
             tiles: Vec::with_capacity(4 * listed.len()),
             ends: Vec::with_capacity(listed.len()),
+            pairs: 0,
         };
         let mut block = Block::new();
         let outputs = splats.chunks_mut(LANES).zip(depths.chunks_mut(LANES));
@@ -79,8 +73,8 @@ vectorized! {
             block.prepare(emission.alpha_min, splats);
             let before = emitted.tiles.len();
             block.emit(emission.grid, splats, &mut emitted);
-            let own = (emitted.tiles.len() - before) as u64;
-            if emission.pairs.fetch_add(own, Relaxed) + own > emission.limit {
+            emitted.pairs += (emitted.tiles.len() - before) as u64;
+            if !emission.keeps {
                 emitted.tiles.clear();
             }
         }
@@ -271,9 +265,14 @@ mod tests {
         let listed: Vec<u32> = (0..opacities.len() as u32).collect();
         let mut splats = vec![Splat::default(); listed.len()];
         let mut depths = vec![0.0; listed.len()];
-        let emission = Emission::new(&packed, &opacities, &args, u64::MAX);
-        let Emitted { tiles, ends } = emit(&emission, &listed, &mut splats, &mut depths);
-        assert_eq!(emission.pairs(), tiles.len() as u64);
+        let mut emitted = |keeps| {
+            let emission = Emission::new(&packed, &opacities, &args, keeps);
+            emit(&emission, &listed, &mut splats, &mut depths)
+        };
+        let counted = emitted(false);
+        let Emitted { tiles, ends, pairs } = emitted(true);
+        assert_eq!((counted.pairs, counted.tiles.len()), (pairs, 0));
+        assert_eq!(pairs, tiles.len() as u64);
         assert_eq!(ends.len(), listed.len());
         assert!(depths.iter().all(|depth| *depth == 1.0));
 
