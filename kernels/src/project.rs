@@ -25,6 +25,8 @@ use crate::math::{Mat3, Quat, Vec3, is_finite};
 
 /// Floats of one projected splat: mean x, y, depth z, w11, w21, w22, compensation, extent x, y.
 pub const PACKED: usize = 9;
+/// Which of them is the extent along x: above zero exactly where the splat was not culled.
+pub(crate) const EXTENT: usize = 7;
 
 /// Splats larger than this many pixels are all alike: constant over any picture.
 const SIZE_MAX: f32 = 1e12;

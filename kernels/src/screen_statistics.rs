@@ -13,10 +13,7 @@ use cubecl::prelude::*;
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 use crate::math::is_finite;
-use crate::project::PACKED;
-
-/// Column of packed splats that has the extent along x.
-const EXTENT: usize = 7;
+use crate::project::{EXTENT, PACKED};
 
 /// What the sums of one camera must move.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {

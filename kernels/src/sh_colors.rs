@@ -7,9 +7,12 @@
 //! Gradients of Gaussians are summed over cameras inside one unit; those of the centres by blocks of Gaussians and then
 //! over the blocks, in order: no atomics.
 //!
-//! Floor per Gaussian, with K = `(degree + 1)²`: 12 bytes of mean and 12 K of coefficients read; for every camera 12
-//! written and about 9 K + 25 operations. Gradients: 12 + 12 K read and for every camera 12; 12 + 12 K written; for
-//! every camera about 24 K + 40 operations. Gradients of centres, if wanted, read and compute that once more.
+//! What a camera culled is not evaluated, if the packed splats are given: it is black and passes nothing on.
+//!
+//! Floor, with K = `(degree + 1)²`: 12 bytes of mean and 12 K of coefficients read per Gaussian that a camera sees; for
+//! every camera 4 read and 12 written of each Gaussian, and about 9 K + 25 operations of each that it sees. Gradients:
+//! 12 + 12 K read of each that is seen, and for every camera 12 and of each that it sees 4; 12 + 12 K written; for every
+//! camera about 24 K + 40 operations of each that it sees. Gradients of centres, if wanted, read and compute that once more.
 
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
@@ -19,6 +22,7 @@ use crate::launch::{
     Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, F16, F32, HalfBuffer, cube_count, per_element,
 };
 use crate::math::{Vec3, is_below_zero};
+use crate::project::{EXTENT, PACKED};
 use crate::reduce::{sum_blocks, sum_units};
 use crate::sh::{basis, direction_vjp, functions, guarded_dot, inverse_length, usable_degree};
 
@@ -29,15 +33,15 @@ const CENTER_BLOCK: usize = CUBE_UNITS_USIZE * CENTER_ITEMS;
 
 /// What forward and gradient must move for one camera.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
-    let n = sizes.gaussians;
+    let (n, seen) = (sizes.gaussians, sizes.visible);
     let coefficients = 12 * functions(sizes.degree) as u64;
     [
         Bytes {
-            read: (12 + coefficients) * n,
+            read: (12 + coefficients) * seen + 4 * n,
             written: 12 * n,
         },
         Bytes {
-            read: (24 + coefficients) * n,
+            read: (16 + coefficients) * seen + 12 * n,
             written: (12 + coefficients) * n,
         },
     ]
@@ -74,6 +78,8 @@ pub struct ShInputs {
     pub means: Buffer,
     /// Where the cameras stand [C, 3].
     pub centers: Buffer,
+    /// Packed splats [C, N, 9], if those that are culled there are to stay without a colour.
+    pub seen: Option<Buffer>,
 }
 
 impl ShInputs {
@@ -91,6 +97,14 @@ impl ShInputs {
     fn degree(&self, degree: usize) -> usize {
         let stored = self.sh_rest.as_ref().map_or(0, |_| self.stored);
         usable_degree(degree, 1 + stored)
+    }
+
+    /// Packed splats, or something to bind in their place; and whether they are read.
+    fn seen(&self) -> (BufferArg, bool) {
+        match &self.seen {
+            Some(packed) => (packed.arg(), true),
+            None => (self.sh0.arg(), false),
+        }
     }
 
     /// Something to bind in place of coefficients that are not read.
@@ -130,6 +144,16 @@ fn coefficient<R: Float>(rest: &[R], at: usize) -> Vec3 {
     )
 }
 
+/// Whether a camera sees a Gaussian: where nobody asks, it does.
+#[cube]
+fn is_seen(packed: &[f32], index: usize, #[comptime] asked: bool) -> bool {
+    if comptime!(asked) {
+        packed[index * PACKED + EXTENT] > 0.0f32
+    } else {
+        true.runtime()
+    }
+}
+
 /// The colour before the clamp. Fused multiply-adds are spelled out, so that the gradient finds the same sign.
 #[cube]
 fn unclamped<R: Float>(
@@ -167,22 +191,29 @@ fn sh_colors_forward<R: Float>(
     rest: &[R],
     means: &[f32],
     centers: &[f32],
+    packed: &[f32],
     colors: &mut [f32],
     gaussians: u32,
     cameras: u32,
     stored: u32,
     #[comptime] degree: usize,
+    #[comptime] asked: bool,
     #[define(R)] _stored_as: ElemType,
 ) {
     let gaussians = gaussians as usize;
     let index = ABSOLUTE_POS;
     if index < gaussians * cameras as usize {
-        let gaussian = index % gaussians;
-        let sight = sight(means, centers, gaussian, index / gaussians);
-        let mut y = Array::<f32>::new(comptime!(functions(degree)));
-        basis(sight.unit, &mut y, degree);
-        let color = unclamped::<R>(sh0, rest, &y, gaussian, stored as usize, degree);
-        Vec3::new(clamped(color.x), clamped(color.y), clamped(color.z)).store(colors, index * 3);
+        if is_seen(packed, index, asked) {
+            let gaussian = index % gaussians;
+            let sight = sight(means, centers, gaussian, index / gaussians);
+            let mut y = Array::<f32>::new(comptime!(functions(degree)));
+            basis(sight.unit, &mut y, degree);
+            let color = unclamped::<R>(sh0, rest, &y, gaussian, stored as usize, degree);
+            Vec3::new(clamped(color.x), clamped(color.y), clamped(color.z))
+                .store(colors, index * 3);
+        } else {
+            Vec3::new(0.0f32, 0.0f32, 0.0f32).store(colors, index * 3);
+        }
     }
 }
 
@@ -191,6 +222,7 @@ pub fn sh_colors(client: &Client, inputs: &ShInputs, degree: usize) -> Buffer {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
     let colors = Buffer::empty(client, cameras * gaussians * 3);
     let (rest, stored_as) = inputs.rest();
+    let (packed, asked) = inputs.seen();
     if let Some((count, dim)) = per_element(cameras * gaussians) {
         sh_colors_forward::launch(
             client,
@@ -200,11 +232,13 @@ pub fn sh_colors(client: &Client, inputs: &ShInputs, degree: usize) -> Buffer {
             rest,
             inputs.means.arg(),
             inputs.centers.arg(),
+            packed,
             colors.arg(),
             gaussians as u32,
             cameras as u32,
             inputs.stored as u32,
             inputs.degree(degree),
+            asked,
             stored_as,
         );
     }
@@ -249,6 +283,7 @@ fn sh_colors_backward_gaussians<R: Float>(
     rest: &[R],
     means: &[f32],
     centers: &[f32],
+    packed: &[f32],
     grad_colors: &[f32],
     grad_sh0: &mut [f32],
     grad_rest: &mut [f32],
@@ -258,6 +293,7 @@ fn sh_colors_backward_gaussians<R: Float>(
     stored: u32,
     #[comptime] degree: usize,
     #[comptime] wanted: [bool; 3],
+    #[comptime] asked: bool,
     #[define(R)] _stored_as: ElemType,
 ) {
     let gaussians = gaussians as usize;
@@ -274,9 +310,10 @@ fn sh_colors_backward_gaussians<R: Float>(
         let mut mean_y = 0.0f32;
         let mut mean_z = 0.0f32;
         for camera in 0..cameras as usize {
-            let g = Vec3::load(grad_colors, (camera * gaussians + gaussian) * 3);
-            // Of a splat that is not seen nothing is evaluated: were it NaN, zero times it would be too.
-            if g.max_abs() != 0.0f32 {
+            let index = camera * gaussians + gaussian;
+            let g = Vec3::load(grad_colors, index * 3);
+            // Of a splat without a gradient nothing is evaluated: were it NaN, zero times it would be too.
+            if g.max_abs() != 0.0f32 && is_seen(packed, index, asked) {
                 let sight = sight(means, centers, gaussian, camera);
                 basis(sight.unit, &mut y, degree);
                 let color = unclamped::<R>(sh0, rest, &y, gaussian, stored, degree);
@@ -323,6 +360,7 @@ fn sh_colors_backward_centers<R: Float>(
     rest: &[R],
     means: &[f32],
     centers: &[f32],
+    packed: &[f32],
     grad_colors: &[f32],
     partials: &mut [f32],
     gaussians: u32,
@@ -330,6 +368,7 @@ fn sh_colors_backward_centers<R: Float>(
     blocks: u32,
     stored: u32,
     #[comptime] degree: usize,
+    #[comptime] asked: bool,
     #[define(R)] _stored_as: ElemType,
 ) {
     let mut shared = Shared::new_slice(CUBE_UNITS_USIZE);
@@ -344,9 +383,10 @@ fn sh_colors_backward_centers<R: Float>(
         for item in 0..CENTER_ITEMS {
             let gaussian = block * CENTER_BLOCK + item * CUBE_UNITS_USIZE + UNIT_POS as usize;
             if gaussian < gaussians {
-                let g = Vec3::load(grad_colors, (camera * gaussians + gaussian) * 3);
+                let index = camera * gaussians + gaussian;
+                let g = Vec3::load(grad_colors, index * 3);
                 // As above: what is broken and not seen must not reach the camera.
-                if g.max_abs() != 0.0f32 {
+                if g.max_abs() != 0.0f32 && is_seen(packed, index, asked) {
                     let sight = sight(means, centers, gaussian, camera);
                     let mut values = Array::<f32>::new(comptime!(functions(degree)));
                     basis(sight.unit, &mut values, degree);
@@ -387,6 +427,7 @@ pub fn sh_colors_backward(
         && let Some((count, dim)) = per_element(gaussians)
     {
         let (rest, stored_as) = inputs.rest();
+        let (packed, asked) = inputs.seen();
         sh_colors_backward_gaussians::launch(
             client,
             count,
@@ -395,6 +436,7 @@ pub fn sh_colors_backward(
             rest,
             inputs.means.arg(),
             inputs.centers.arg(),
+            packed,
             grad_colors.arg(),
             grads[0].arg(),
             grads[1].arg(),
@@ -404,6 +446,7 @@ pub fn sh_colors_backward(
             inputs.stored as u32,
             degree,
             [wanted[0], wanted[1], wanted[2]],
+            asked,
             stored_as,
         );
     }
@@ -412,6 +455,7 @@ pub fn sh_colors_backward(
         let partials = Buffer::empty(client, cameras * blocks * 3);
         if !partials.is_empty() {
             let (rest, stored_as) = inputs.rest();
+            let (packed, asked) = inputs.seen();
             sh_colors_backward_centers::launch(
                 client,
                 cube_count(cameras * blocks),
@@ -420,6 +464,7 @@ pub fn sh_colors_backward(
                 rest,
                 inputs.means.arg(),
                 inputs.centers.arg(),
+                packed,
                 grad_colors.arg(),
                 partials.arg(),
                 gaussians as u32,
@@ -427,6 +472,7 @@ pub fn sh_colors_backward(
                 blocks as u32,
                 inputs.stored as u32,
                 degree,
+                asked,
                 stored_as,
             );
         }

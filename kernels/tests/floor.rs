@@ -21,7 +21,7 @@ fn total(sizes: &Sizes) -> u64 {
 /// From the shapes of the tensors: what a stage is given and what it leaves.
 #[test]
 fn floors_are_the_bytes_of_inputs_and_results() {
-    let (n, i, pixels) = (1000, 3000, 160 * 128);
+    let (n, seen, i, pixels) = (1000, 700, 3000, 160 * 128);
     let floors: std::collections::BTreeMap<_, _> = step(&SIZES).into_iter().collect();
     // Means, quaternions, scales; packed splats.
     let splats = Bytes {
@@ -29,12 +29,18 @@ fn floors_are_the_bytes_of_inputs_and_results() {
         written: n * 4 * 9,
     };
     assert_eq!(floors["project"], splats);
-    // Coefficients of degree 3 and means; colours.
+    // Coefficients of degree 3 and means of what is seen, as its extent says; colours of all.
     let colours = Bytes {
-        read: n * 4 * (16 * 3 + 3),
+        read: seen * 4 * (16 * 3 + 3) + n * 4,
         written: n * 4 * 3,
     };
     assert_eq!(floors["colours"], colours);
+    // The same and their gradients, after those of the colours; gradients of all.
+    let colours = Bytes {
+        read: n * 4 * 3 + seen * 4 * (16 * 3 + 3 + 1),
+        written: n * 4 * (16 * 3 + 3),
+    };
+    assert_eq!(floors["colours gradient"], colours);
     // The image and the photo of 8 bits; three derivatives of each value.
     let photometric = Bytes {
         read: pixels * 3 * (4 + 1),

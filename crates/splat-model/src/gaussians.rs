@@ -3,7 +3,7 @@
 use burn::module::{Module, Param};
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use splat_ops::device::reads_half;
-use splat_ops::{OpError, SH_DEGREE_MAX, exp, sh_coefficient_count, sh_colors, sigmoid};
+use splat_ops::{OpError, Projected, SH_DEGREE_MAX, exp, sh_coefficient_count, sh_colors, sigmoid};
 
 use crate::files::SplatData;
 
@@ -151,17 +151,24 @@ impl Gaussians {
         sigmoid(self.opacity_logits.val())
     }
 
-    /// Colours `[C, N, 3]` as cameras with the given centres `[C, 3]` see them, with spherical harmonics up to `degree`.
+    /// Colours `[C, N, 3]` as cameras with the given centres `[C, 3]` see them, with spherical harmonics up to `degree`; only
+    /// of those that were not culled, if what the same cameras have `seen` is given (the others are black).
     ///
     /// # Errors
-    /// When the model has no coefficients of that degree, or the centres do not fit.
-    pub fn colors(&self, centers: Tensor<2>, degree: usize) -> Result<Tensor<3>, OpError> {
+    /// When the model has no coefficients of that degree, or the centres or what was seen do not fit.
+    pub fn colors(
+        &self,
+        centers: Tensor<2>,
+        degree: usize,
+        seen: Option<&Projected>,
+    ) -> Result<Tensor<3>, OpError> {
         sh_colors(
             self.sh0.val(),
             self.sh_rest.as_ref().map(|rest| rest.val()),
             self.means.val(),
             centers,
             degree,
+            seen,
         )
     }
 }
@@ -205,7 +212,7 @@ mod tests {
             Err(error) => eprintln!("\n*** SKIPPED: no wgpu adapter: {error} ***\n"),
         }
         let colors = |gaussians: &Gaussians, device: &Device| {
-            let colors = gaussians.colors(Tensor::<2>::ones([1, 3], device), 1);
+            let colors = gaussians.colors(Tensor::<2>::ones([1, 3], device), 1, None);
             host(colors.unwrap())
         };
         for device in devices {

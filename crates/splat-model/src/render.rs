@@ -67,7 +67,7 @@ pub fn render_projected(
     settings: &RenderSettings,
 ) -> Result<Rendered, OpError> {
     let degree = settings.sh_degree.min(gaussians.sh_degree());
-    let colors = gaussians.colors(cameras.centers(), degree)?;
+    let colors = gaussians.colors(cameras.centers(), degree, Some(projected))?;
     let [count, _, _] = colors.dims();
     let background = settings.background.map(|color| {
         let color = Tensor::<1>::from_floats(color, &colors.device());

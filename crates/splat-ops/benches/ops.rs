@@ -92,7 +92,8 @@ fn time_of_the_ops_beside_project_and_rasterize() {
                 || {
                     let rest = Some(rest.clone());
                     let colors =
-                        sh_colors(sh0.clone(), rest, means.clone(), centers.clone(), 3).unwrap();
+                        sh_colors(sh0.clone(), rest, means.clone(), centers.clone(), 3, None)
+                            .unwrap();
                     let grads = colors.sum().backward();
                     assert!(means.grad(&grads).is_some());
                 },
@@ -112,7 +113,7 @@ fn time_of_the_ops_beside_project_and_rasterize() {
                 || {
                     let (sh0, means) = (constant(&sh0), means.clone().inner());
                     let rest = Some(rest.clone());
-                    sh_colors(sh0, rest, means, centers.clone().inner(), 3).unwrap();
+                    sh_colors(sh0, rest, means, centers.clone().inner(), 3, None).unwrap();
                 },
             );
         }

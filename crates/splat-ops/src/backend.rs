@@ -21,6 +21,9 @@ use crate::ssim::SsimArgs;
 /// `[mean_x, mean_y, depth, w11, w21, w22, compensation, extent_x, extent_y]`.
 pub const PROJECTED_WIDTH: usize = 9;
 
+/// Which of them is `extent_x`: above zero exactly where the splat was not culled.
+pub const PROJECTED_EXTENT: usize = 7;
+
 /// The forward and backward computations of one backend. Callers have checked all shapes; tensors
 /// need not be contiguous. `wanted` says which gradients are needed, in the order of the inputs;
 /// the others are `None` and cost nothing.
@@ -198,6 +201,8 @@ pub struct ShInputs<B: Backend> {
     pub means: FloatTensor<B>,
     /// `[C, 3]`.
     pub centers: FloatTensor<B>,
+    /// Packed splats `[C, N, 9]`, of which those without an extent have no colour.
+    pub seen: Option<FloatTensor<B>>,
 }
 
 /// A parameter and its moments, in the form in which Burn's dispatch can carry them.
@@ -264,6 +269,7 @@ pub(crate) trait SplatOps: Backend {
         #[extension_type] sh_rest: Optional<Self>,
         means: FloatTensor<Self>,
         centers: FloatTensor<Self>,
+        #[extension_type] seen: Optional<Self>,
         degree: usize,
     ) -> FloatTensor<Self>;
 
@@ -334,6 +340,7 @@ macro_rules! forward_only {
                 sh_rest: Optional<Self>,
                 means: FloatTensor<Self>,
                 centers: FloatTensor<Self>,
+                seen: Optional<Self>,
                 degree: usize,
             ) -> FloatTensor<Self> {
                 let inputs = ShInputs {
@@ -341,6 +348,7 @@ macro_rules! forward_only {
                     sh_rest: sh_rest.into_option(),
                     means,
                     centers,
+                    seen: seen.into_option(),
                 };
                 Self::sh_colors_forward(inputs, degree)
             }

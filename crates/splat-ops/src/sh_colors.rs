@@ -3,10 +3,10 @@
 use burn::backend::Dispatch;
 use burn::tensor::{DType, Tensor};
 
-use crate::backend::{Optional, SplatOps};
+use crate::backend::{Optional, PROJECTED_WIDTH, SplatOps};
 use crate::check::Checker;
 use crate::device::reads_half;
-use crate::{OpError, SH_DEGREE_MAX, sh_coefficient_count};
+use crate::{OpError, Projected, SH_DEGREE_MAX, sh_coefficient_count};
 
 /// Colours `[C, N, 3]` of N Gaussians in C cameras: `max(SH(mean - centre) + 0.5, 0)`, SH being
 /// [`spherical_harmonics`](crate::spherical_harmonics) of the coefficients `[sh0, sh_rest]`.
@@ -22,6 +22,8 @@ use crate::{OpError, SH_DEGREE_MAX, sh_coefficient_count};
 /// - `means` `[N, 3]`: world space.
 /// - `centers` `[C, 3]`: where the cameras stand.
 /// - `degree`: 0 to 3.
+/// - `seen`: the same Gaussians projected by the same cameras. Those that are culled there (no extent) are black and pass no
+///   gradient on; their coefficients are not read. Without it all colours are computed.
 ///
 /// A channel that is clamped at zero passes no gradient on; one that is exactly zero does.
 ///
@@ -33,6 +35,7 @@ pub fn sh_colors(
     means: Tensor<2>,
     centers: Tensor<2>,
     degree: usize,
+    seen: Option<&Projected>,
 ) -> Result<Tensor<3>, OpError> {
     let check = Checker::new("sh_colors", "sh0", &sh0)?;
     let [n, _, _] = sh0.dims();
@@ -59,6 +62,15 @@ pub fn sh_colors(
             sh_coefficient_count(degree)
         )));
     }
+    let seen = match seen {
+        Some(seen) => {
+            let (packed, c) = (seen.packed(), centers.dims()[0]);
+            let expected = [Some(c), Some(n), Some(PROJECTED_WIDTH)];
+            check.tensor("seen", &packed, expected, "[C, N, 9]")?;
+            Optional::Some(packed.into_dispatch())
+        }
+        None => Optional::None,
+    };
     let rest = match sh_rest {
         Some(rest) if degree > 0 => Optional::Some(rest.into_dispatch()),
         _ => Optional::None,
@@ -68,6 +80,7 @@ pub fn sh_colors(
         rest,
         means.into_dispatch(),
         centers.into_dispatch(),
+        seen,
         degree,
     );
     Ok(Tensor::from_dispatch(colors))

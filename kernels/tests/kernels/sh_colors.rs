@@ -81,6 +81,7 @@ fn halves_are_read_as_the_numbers_they_stand_for() {
         stored: 15,
         means: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
         centers: upload(&client, &uniform(&mut rng, cameras * 3, -1.0, 1.0)),
+        seen: None,
     };
     let half = ShInputs {
         sh_rest: Some(ShRest::Half(HalfBuffer::new(handle, halves.len()).unwrap())),

@@ -48,9 +48,11 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
         sh_rest: Optional<Self>,
         means: FloatTensor<Self>,
         centers: FloatTensor<Self>,
+        seen: Optional<Self>,
         degree: usize,
     ) -> FloatTensor<Self> {
-        sh_colors::sh_colors::<B, C>(sh0, sh_rest.into_option(), means, centers, degree)
+        let (sh_rest, seen) = (sh_rest.into_option(), seen.into_option());
+        sh_colors::sh_colors::<B, C>(sh0, sh_rest, means, centers, seen, degree)
     }
 
     fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self> {

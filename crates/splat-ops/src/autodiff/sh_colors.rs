@@ -1,4 +1,5 @@
-//! `sh_colors`: saves its inputs. At degree 0 the coefficients of that degree are the only parent.
+//! `sh_colors`: saves its inputs. At degree 0 the coefficients of that degree are the only parent; what was seen never is
+//! one.
 
 use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
 use burn::backend::autodiff::grads::Gradients;
@@ -42,6 +43,7 @@ pub(super) fn sh_colors<B: SplatBackend, C: CheckpointStrategy>(
     sh_rest: Option<FloatTensor<Autodiff<B, C>>>,
     means: FloatTensor<Autodiff<B, C>>,
     centers: FloatTensor<Autodiff<B, C>>,
+    seen: Option<FloatTensor<Autodiff<B, C>>>,
     degree: usize,
 ) -> FloatTensor<Autodiff<B, C>> {
     let inputs = |sh_rest| ShInputs {
@@ -49,6 +51,7 @@ pub(super) fn sh_colors<B: SplatBackend, C: CheckpointStrategy>(
         sh_rest,
         means: means.clone().into_primitive(),
         centers: centers.clone().into_primitive(),
+        seen: seen.map(|seen| seen.into_primitive()),
     };
     match sh_rest {
         Some(rest) => {

@@ -16,7 +16,7 @@ use super::parts::{Part, Uncleared};
 use super::rasterize::Splat;
 use super::real::Real;
 use crate::OpError;
-use crate::backend::PROJECTED_WIDTH;
+use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH};
 use crate::settings::RasterizeArgs;
 use emit::{Emission, Emitted, emit};
 
@@ -91,7 +91,7 @@ fn visible<T: Real>(
     let alpha_min = T::of(args.settings.alpha_min);
     let (mut visible, mut count) = (vec![0; gaussians.len()], 0);
     for n in gaussians {
-        let (extent, opacity) = (packed[n * PROJECTED_WIDTH + 7], opacities[n]);
+        let (extent, opacity) = (packed[n * PROJECTED_WIDTH + PROJECTED_EXTENT], opacities[n]);
         let is_seen = (extent > T::ZERO) & (opacity >= alpha_min) & opacity.is_finite();
         // Written in any case: whether it counts would be guessed wrongly as often as not.
         visible[count] = n as u32;
@@ -405,8 +405,8 @@ mod tests {
         let expected: Vec<u32> = (0..count as u32).collect();
         assert_eq!(all(&packed, &colors, &opacities, 0), expected);
 
-        packed[1][7] = 0.0;
-        packed[2][7] = f32::NAN;
+        packed[1][PROJECTED_EXTENT] = 0.0;
+        packed[2][PROJECTED_EXTENT] = f32::NAN;
         opacities[4] = 0.003;
         opacities[5] = f32::NAN;
         opacities[6] = f32::INFINITY;

@@ -8,11 +8,10 @@ use rayon::prelude::*;
 
 use super::buffer::BufferMut;
 use super::real::Real;
+use crate::backend::PROJECTED_EXTENT;
 
 /// Gaussians per unit of parallel work, at least.
 const CHUNK: usize = 4096;
-/// Column of packed splats that has the extent along x.
-const EXTENT: usize = 7;
 
 /// `[C, N, 9]`, read where it lies.
 struct Rows<'a, T> {
@@ -64,7 +63,7 @@ pub(super) fn add<T: Real>(
         .for_each(|(n, (total, views))| {
             let (mut sum, mut count) = (T::ZERO, T::ZERO);
             for c in 0..cameras {
-                if packed.at(c, n, EXTENT) > T::ZERO {
+                if packed.at(c, n, PROJECTED_EXTENT) > T::ZERO {
                     let (x, y) = (gradient.at(c, n, 0) * width, gradient.at(c, n, 1) * height);
                     let length = (x * x + y * y).sqrt();
                     // What is not finite must not hide the other views of the same Gaussian.

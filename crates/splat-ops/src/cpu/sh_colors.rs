@@ -18,18 +18,19 @@ use super::simd::{LANES, Lanes, for_each_block, vectorized};
 use super::spherical_harmonics::{
     COUNT_MAX, basis, basis_gradient, guarded_dot, is_zero, normalize,
 };
-use crate::backend::ShInputs;
+use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH, ShInputs};
 use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
 
 /// Gaussians per unit of parallel work. Fixed, so that sums over Gaussians have a fixed order.
 const CHUNK: usize = 512;
 
-/// The four inputs.
+/// The inputs.
 struct Tensors {
     sh0: Buffer,
     sh_rest: Option<Buffer>,
     means: Buffer,
     centers: Buffer,
+    seen: Option<Buffer>,
 }
 
 impl Tensors {
@@ -39,6 +40,7 @@ impl Tensors {
             sh_rest: inputs.sh_rest.map(Buffer::new),
             means: Buffer::new(inputs.means),
             centers: Buffer::new(inputs.centers),
+            seen: inputs.seen.map(Buffer::new),
         }
     }
 
@@ -49,12 +51,13 @@ impl Tensors {
             stored: self.sh_rest.as_ref().map_or(0, |rest| rest.dims::<3>()[1]),
             means: self.means.slice(),
             centers: self.centers.slice(),
+            seen: self.seen.as_ref().map(Buffer::slice),
             degree,
         }
     }
 }
 
-/// The four inputs as slices.
+/// The inputs as slices.
 struct Inputs<'a, T> {
     sh0: &'a [T],
     rest: &'a [T],
@@ -62,12 +65,26 @@ struct Inputs<'a, T> {
     stored: usize,
     means: &'a [T],
     centers: &'a [T],
+    /// Packed splats.
+    seen: Option<&'a [T]>,
     degree: usize,
 }
 
 impl<'a, T: Real> Inputs<'a, T> {
     fn count(&self) -> usize {
         self.means.len() / 3
+    }
+
+    /// The centre of a camera, and whether it sees a Gaussian, by its index.
+    fn camera(&self, camera: usize) -> (&'a [T], impl Fn(usize) -> bool + 'a) {
+        let packed = self.seen.map(|seen| {
+            let width = self.count() * PROJECTED_WIDTH;
+            &seen[camera * width..][..width]
+        });
+        let is_seen = move |n: usize| {
+            packed.is_none_or(|packed| packed[n * PROJECTED_WIDTH + PROJECTED_EXTENT] > T::ZERO)
+        };
+        (&self.centers[3 * camera..3 * camera + 3], is_seen)
     }
 
     /// Some coefficients of one Gaussian, from the one after the first; each with the number that follows it in memory, or
@@ -143,26 +160,30 @@ macro_rules! by_degree {
 }
 
 vectorized! {
-    /// The colours of Gaussians that lie side by side, given the basis in their directions.
+    /// Writes the colours of some Gaussians to where they lie behind that of the `first`, given the basis in their
+    /// directions.
     fn colors_of_rows<T: Real, const FMA: bool>(
         inputs: &Inputs<T>,
+        rows: &[usize],
         first: usize,
         basis: &[Lanes<T>; COUNT_MAX],
         colors: &mut [T],
     ) {
-        by_degree!(inputs.degree, colors_of_degree::<T>(inputs, first, basis, colors));
+        by_degree!(inputs.degree, colors_of_degree::<T>(inputs, rows, first, basis, colors));
     }
 }
 
 #[inline(always)]
 fn colors_of_degree<T: Real, const REST: usize>(
     inputs: &Inputs<T>,
+    rows: &[usize],
     first: usize,
     basis: &[Lanes<T>; COUNT_MAX],
     colors: &mut [T],
 ) {
-    let values = inputs.colors::<REST>(first..first + colors.len() / 3, basis);
-    for (out, values) in colors.chunks_exact_mut(3).zip(values) {
+    let values = inputs.colors::<REST>(rows.iter().copied(), basis);
+    for (row, values) in rows.iter().zip(values) {
+        let out = &mut colors[3 * (row - first)..][..3];
         for (out, value) in out.iter_mut().zip(values) {
             // NaN stays.
             *out = if value < T::ZERO { T::ZERO } else { value };
@@ -261,16 +282,15 @@ pub(super) fn forward<T: Real>(
     let mut colors = Uncleared::<T>::new(c * n * 3);
     let parts = colors.chunks_of_each(c, 3 * CHUNK);
     parts.into_par_iter().for_each(|(camera, first, part)| {
-        let center = &inputs.centers[3 * camera..3 * camera + 3];
-        let blocks = part.overwritten().chunks_mut(3 * LANES);
-        for (first, colors) in (first / 3..).step_by(LANES).zip(blocks) {
-            let rows = first..first + colors.len() / 3;
-            let directions = inputs.directions(rows, center);
+        let (center, is_seen) = inputs.camera(camera);
+        let (first, colors) = (first / 3, part.cleared());
+        for_each_block(first..first + colors.len() / 3, is_seen, |rows| {
+            let directions = inputs.directions(rows.iter().copied(), center);
             let mut units = [[T::ZERO; LANES]; 4];
             let mut basis = [[T::ZERO; LANES]; COUNT_MAX];
             evaluate(degree, &directions, &mut units, &mut basis);
-            colors_of_rows(&inputs, first, &basis, colors);
-        }
+            colors_of_rows(&inputs, rows, first, &basis, colors);
+        });
     });
     tensor(colors.written(), [c, n, 3])
 }
@@ -289,9 +309,10 @@ struct Chunk<'a, T> {
 
 impl<T: Real> Chunk<'_, T> {
     /// Adds the gradients through one camera, given those of its colours; returns that of its centre.
-    fn add(&mut self, inputs: &Inputs<T>, center: &[T], grad: &[T]) -> Vec3<T> {
+    fn add(&mut self, inputs: &Inputs<T>, camera: usize, grad: &[T]) -> Vec3<T> {
         let mut of_center = [T::ZERO; 3];
-        let is_graded = |row: usize| !is_zero(&grad[3 * row..3 * row + 3]);
+        let (center, is_seen) = inputs.camera(camera);
+        let is_graded = |row: usize| !is_zero(&grad[3 * row..3 * row + 3]) && is_seen(row);
         for_each_block(self.rows.clone(), is_graded, |rows| {
             self.add_block(rows, inputs, center, grad, &mut of_center);
         });
@@ -454,9 +475,9 @@ pub(super) fn backward<T: Real>(
                 directions: wanted[2] || wanted[3],
                 is_clear: true,
             };
-            let views = inputs.centers.chunks_exact(3).zip(grad.chunks_exact(3 * n));
+            let views = grad.chunks_exact(3 * n).enumerate();
             views
-                .map(|(center, grad)| chunk.add(&inputs, center, grad))
+                .map(|(camera, grad)| chunk.add(&inputs, camera, grad))
                 .collect()
         })
         .collect();

@@ -11,12 +11,13 @@ use splat_kernels::sh_colors as kernels;
 use super::{buffer, prepare, tensor};
 use crate::backend::ShInputs;
 
-/// The four inputs, ready for the kernels.
+/// The inputs, ready for the kernels.
 struct Prepared {
     sh0: CubeTensor,
     sh_rest: Option<CubeTensor>,
     means: CubeTensor,
     centers: CubeTensor,
+    seen: Option<CubeTensor>,
 }
 
 impl Prepared {
@@ -27,6 +28,7 @@ impl Prepared {
             sh_rest: inputs.sh_rest.map(into_contiguous),
             means: prepare(inputs.means),
             centers: prepare(inputs.centers),
+            seen: inputs.seen.map(prepare),
         }
     }
 
@@ -46,6 +48,7 @@ impl Prepared {
             stored: self.sh_rest.as_ref().map_or(0, |rest| rest.shape()[1]),
             means: buffer(&self.means),
             centers: buffer(&self.centers),
+            seen: self.seen.as_ref().map(buffer),
         }
     }
 }

@@ -86,6 +86,7 @@ impl Scene {
             means.clone(),
             centers.clone(),
             3,
+            Some(&projected),
         )
         .unwrap();
         let logits = leaf(uniform(&[c, n], -9.0, 9.0));

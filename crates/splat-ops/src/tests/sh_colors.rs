@@ -1,11 +1,12 @@
 //! `sh_colors` against the ops it is made of: values and all gradients, in double precision and on every device.
 
-use burn::tensor::{DType, Device, Tensor, TensorData};
+use burn::tensor::{Bool, DType, Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 
 use super::devices;
-use crate::{sh_coefficient_count, sh_colors, spherical_harmonics};
+use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH};
+use crate::{ImageSize, Projected, sh_coefficient_count, sh_colors, spherical_harmonics};
 
 /// Inputs as leaves: sh0, sh_rest, means, centres.
 struct Leaves {
@@ -45,7 +46,7 @@ impl Leaves {
         }
     }
 
-    fn fused(&self, degree: usize) -> Tensor<3> {
+    fn fused(&self, degree: usize, seen: Option<&Projected>) -> Tensor<3> {
         let [sh0, rest] = [&self.sh0, &self.sh_rest].map(|x| x.clone());
         sh_colors(
             sh0,
@@ -53,6 +54,7 @@ impl Leaves {
             self.means.clone(),
             self.centers.clone(),
             degree,
+            seen,
         )
         .unwrap()
     }
@@ -81,11 +83,18 @@ impl Leaves {
         let options = (&colors.device(), colors.dtype());
         let weights = Tensor::<3>::from_data(TensorData::new(weights, [c, n, 3]), options);
         let seen = weights.clone().equal_elem(0.0);
-        let grads = (colors.clone().mask_fill(seen.clone(), 0.0) * weights)
-            .sum()
-            .backward();
+        self.values_and_gradients(colors.mask_fill(seen, 0.0), weights)
+    }
+
+    /// Colours, then the gradients that there are, given that of the colours.
+    fn values_and_gradients(
+        &self,
+        colors: Tensor<3>,
+        weights: Tensor<3>,
+    ) -> Vec<(&'static str, Vec<f64>)> {
+        let grads = (colors.clone() * weights).sum().backward();
         let host = |data: TensorData| data.convert::<f64>().try_into_vec::<f64>().unwrap();
-        let mut found = vec![("colors", host(colors.mask_fill(seen, 0.0).into_data()))];
+        let mut found = vec![("colors", host(colors.into_data()))];
         for (name, leaf) in [("sh0", &self.sh0), ("sh_rest", &self.sh_rest)] {
             found.extend(leaf.grad(&grads).map(|grad| (name, host(grad.into_data()))));
         }
@@ -121,7 +130,7 @@ fn colors_and_gradients_are_those_of_the_composed_ops() {
         ] {
             let case = format!("{name}: C = {c}, N = {n}, degree {degree}");
             let leaves = Leaves::new(c, n, &device, dtype);
-            let fused = leaves.results(leaves.fused(degree));
+            let fused = leaves.results(leaves.fused(degree, None));
             let composed = leaves.results(leaves.composed(degree));
             // At degree 0 the direction and the rest are no part of it.
             assert_eq!(fused.len(), if degree == 0 { 2 } else { 5 }, "{case}");
@@ -135,6 +144,57 @@ fn colors_and_gradients_are_those_of_the_composed_ops() {
     }
 }
 
+/// All else is as without it, bit for bit; whatever lies behind gives what is culled a gradient that must not arrive.
+#[test]
+fn what_a_camera_culled_is_black_and_gets_no_gradient() {
+    let mut cases: Vec<_> = devices()
+        .into_iter()
+        .map(|(name, device)| (name, device, DType::F32))
+        .collect();
+    cases.push(("Flex f64", Device::flex(), DType::F64));
+    for (name, device, dtype) in cases {
+        let device = device.autodiff();
+        for (c, n, degree) in [(1, 700, 3), (2, 65, 0), (3, 33, 2), (1, 1100, 1)] {
+            let leaves = Leaves::new(c, n, &device, dtype);
+            // The third Gaussian, whose coefficients are no numbers, among what no camera sees; the last chunk ends with
+            // some that none sees.
+            let is_seen = |camera: usize, gaussian: usize| {
+                gaussian % 3 != 2 && !(gaussian + camera).is_multiple_of(5) && gaussian + 4 < n
+            };
+            let mut packed = vec![0.0; c * n * PROJECTED_WIDTH];
+            let mut culled = vec![false; c * n * 3];
+            for index in 0..c * n {
+                if is_seen(index / n, index % n) {
+                    packed[index * PROJECTED_WIDTH + PROJECTED_EXTENT] = 0.5;
+                } else {
+                    culled[3 * index..3 * index + 3].fill(true);
+                }
+            }
+            let packed = TensorData::new(packed, [c, n, PROJECTED_WIDTH]);
+            let packed = Tensor::<3>::from_data(packed, (&device, dtype)).require_grad();
+            let size = ImageSize {
+                width: 8,
+                height: 8,
+            };
+            let seen = Projected::from_packed(packed, size).unwrap();
+            let culled = TensorData::new(culled, [c, n, 3]);
+            let culled = Tensor::<3, Bool>::from_data(culled, &device);
+
+            let weights = Tensor::<3>::ones([c, n, 3], (&device, dtype)) * 0.75;
+            let found = leaves.fused(degree, Some(&seen));
+            let found = leaves.values_and_gradients(found, weights.clone());
+            let masked = leaves.fused(degree, None).mask_fill(culled, 0.0);
+            let expected = leaves.values_and_gradients(masked, weights);
+            assert_eq!(found.len(), if degree == 0 { 2 } else { 5 }, "{name}");
+            for (found, expected) in found.iter().zip(&expected) {
+                let part = found.0;
+                assert!(found == expected, "{name}, degree {degree}: {part}");
+                assert!(found.1.iter().any(|x| *x != 0.0), "{name}: {part}");
+            }
+        }
+    }
+}
+
 /// A Gaussian with a broken coefficient is to be seen as broken, not as black.
 #[test]
 fn what_is_not_a_number_is_not_clamped() {
@@ -142,7 +202,7 @@ fn what_is_not_a_number_is_not_clamped() {
         let sh0 = [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, -9.0, -0.0, 9.0];
         let sh0 = Tensor::<3>::from_data(TensorData::new(sh0.to_vec(), [2, 1, 3]), &device);
         let [means, centers] = [2, 1].map(|rows| Tensor::<2>::ones([rows, 3], &device));
-        let colors = sh_colors(sh0, None, means, centers, 0).unwrap();
+        let colors = sh_colors(sh0, None, means, centers, 0, None).unwrap();
         let colors = colors.into_data().try_into_vec::<f32>().unwrap();
         assert!(colors[0].is_nan(), "{name}: {colors:?}");
         assert_eq!(colors[1..5], [f32::INFINITY, 0.0, 0.0, 0.5], "{name}");
@@ -161,9 +221,26 @@ fn what_does_not_fit_is_an_error() {
             leaves.means.clone(),
             centers,
             degree,
+            None,
         )
         .unwrap_err()
     };
+    let size = ImageSize {
+        width: 8,
+        height: 8,
+    };
+    let other = Tensor::zeros([1, 7, PROJECTED_WIDTH], &device);
+    let other = Projected::from_packed(other, size).unwrap();
+    let error = sh_colors(
+        leaves.sh0.clone(),
+        None,
+        leaves.means.clone(),
+        leaves.centers.clone(),
+        0,
+        Some(&other),
+    )
+    .unwrap_err();
+    assert!(error.to_string().contains("`seen`"), "{error}");
     let rest = |count: usize| Some(leaves.sh_rest.clone().narrow(1, 0, count));
     for error in [
         refuse(None, leaves.centers.clone(), 1),
@@ -193,7 +270,7 @@ fn half_precision_costs_so_much() {
     let mut leaves = Leaves::new(c, n, &Device::flex().autodiff(), DType::F64);
     leaves.sh0 = (leaves.sh0.set_require_grad(false).clamp_min(-1.0) + 6.0).require_grad();
     leaves.sh_rest = (leaves.sh_rest.set_require_grad(false) * 0.25).require_grad();
-    let expected = leaves.results(leaves.fused(3));
+    let expected = leaves.results(leaves.fused(3, None));
     for (name, device) in devices() {
         let device = device.autodiff();
         for (stored, bounds) in [(DType::F32, [1e-6, 1e-5]), (DType::F16, [1e-4, 4e-4])] {
@@ -211,7 +288,7 @@ fn half_precision_costs_so_much() {
                 means: leaf(&leaves.means),
                 centers: leaf(&leaves.centers),
             };
-            let found = ours.results(ours.fused(3));
+            let found = ours.results(ours.fused(3, None));
             for (part, found) in &found {
                 let (_, expected) = expected.iter().find(|(name, _)| name == part).unwrap();
                 let error = relative(found, expected);
