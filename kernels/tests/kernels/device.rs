@@ -14,6 +14,13 @@ pub fn client() -> Option<Client> {
         // Software devices are not asked whether they have planes, but may.
         let hardware = &client.properties().hardware;
         let size = hardware.plane_size_max;
+        if let Ok(required) = std::env::var("SPLAT_REQUIRE_PLANES") {
+            assert_eq!(
+                size.to_string(),
+                required,
+                "the size of the device's planes"
+            );
+        }
         splat_kernels::force_plane_size((hardware.plane_size_min == size).then_some(size));
         if splat_kernels::plane_size(&client).is_none() {
             eprintln!("\n*** SKIPPED: no planes of one known size here ***\n");
