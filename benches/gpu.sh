@@ -150,7 +150,8 @@ section build - cargo build --release --workspace --bin splat ${features[@]+"${f
 
 # Through wgpu, or SPIR-V with --device vulkan. With --device cuda the kernels are checked on CUDA by the two after it.
 section tests - env SPLAT_REQUIRE_WGPU=1 cargo test --release --workspace ${features[@]+"${features[@]}"} ${tests[@]+"${tests[@]}"}
-section gradcheck - "${splat[@]}" gradcheck tests/fixtures/*.safetensors
+section gradcheck "$folder/gradcheck.json" \
+    "${splat[@]}" gradcheck tests/fixtures/*.safetensors --json "$folder/gradcheck.json"
 if $accuracy; then
     section accuracy "$folder/accuracy.json" "${splat[@]}" bench accuracy --json "$folder/accuracy.json"
 fi
@@ -179,6 +180,9 @@ for capture in "${captures[@]}"; do
 done
 
 if [[ -n $python ]]; then
+    section "gsplat errors" "$folder/gsplat_errors.json" \
+        "$python" benches/gsplat_errors.py tests/fixtures/*.safetensors \
+        --ours "$folder/gradcheck.json" --json "$folder/gsplat_errors.json"
     for capture in "${captures[@]}"; do
         name=$(basename "$capture")
         # After one step a scene is still the capture's first Gaussians, those of `bench step`.
