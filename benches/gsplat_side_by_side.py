@@ -36,6 +36,16 @@ def read(path):
         sys.exit(f"error: {path}: {error.strerror}")
 
 
+def write(path, text):
+    """All of it or nothing."""
+    whole = Path(f"{path}.tmp")
+    try:
+        whole.write_text(text)
+        whole.replace(path)
+    except OSError as error:
+        sys.exit(f"error: {path}: {error.strerror}")
+
+
 def read_ply(path):
     """Fields of a binary little-endian PLY of floats, by name."""
     data = read(path)
@@ -289,7 +299,7 @@ def main():
     text = json.dumps(result, indent=2)
     print(text)
     if args.json:
-        Path(args.json).write_text(text + "\n")
+        write(args.json, text + "\n")
 
 
 if __name__ == "__main__":
