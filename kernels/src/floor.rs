@@ -4,7 +4,8 @@
 //! Each stage states its own beside its kernels (`floor`); here they are put together for one camera. Counted are the
 //! kernels of this crate alone, not the tensor ops between them. Two estimates are in it: the lists of all tiles count
 //! to their ends, also where all pixels stop earlier; and what is said per Gaussian counts all of them, also those out
-//! of view, but for the colours, which leave those out. Neither is a bound that a kernel could not go below by knowing more than its input.
+//! of view, but for the colours, which leave those out. Neither is a bound that a kernel could not go below by knowing more
+//! than its input.
 
 use crate::{
     activation, adam, intersect, photometric, project, rasterize, screen_statistics, sh_colors,

@@ -20,7 +20,7 @@ use cubecl::prelude::*;
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, per_element};
 use crate::math::is_finite;
-use crate::project::PACKED;
+use crate::project::{EXTENT, PACKED};
 use crate::rasterize::MAX_SLOT_VALUES;
 use crate::scan::{PendingTotal, cube_exclusive_sum, exclusive_sum, exclusive_sum_with_total};
 use crate::sort::{bits_for, ordered_bits, sort_first_pairs};
@@ -251,7 +251,7 @@ fn footprint(packed: &[f32], opacities: &[f32], splat: usize, alpha_min: f32) ->
         opacities[splat],
         alpha_min,
     );
-    f.seen = f.seen && packed[at + 7] > 0.0f32;
+    f.seen = f.seen && packed[at + EXTENT] > 0.0f32;
     f
 }
 
