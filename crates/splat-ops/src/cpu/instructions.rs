@@ -2,6 +2,8 @@
 
 use core::fmt;
 
+use macerator::Arch;
+
 /// A set of instructions that the loops are compiled for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum InstructionSet {
@@ -11,7 +13,7 @@ pub enum InstructionSet {
     Avx2,
     /// 64-bit Arm, whose baseline has them.
     Neon,
-    /// What every processor of the target has.
+    /// What every processor of the target has; the rasteriser uses SSE 4.2 where there is that.
     Baseline,
 }
 
@@ -19,18 +21,14 @@ impl InstructionSet {
     /// The one that runs on this processor.
     #[inline]
     pub fn chosen() -> Self {
-        #[cfg(target_arch = "x86_64")]
-        if is_x86_feature_detected!("avx2") && is_x86_feature_detected!("fma") {
-            let wide = is_x86_feature_detected!("avx512f")
-                && is_x86_feature_detected!("avx512bw")
-                && is_x86_feature_detected!("avx512dq")
-                && is_x86_feature_detected!("avx512vl");
-            return if wide { Self::Avx512 } else { Self::Avx2 };
-        }
-        if cfg!(target_arch = "aarch64") {
-            Self::Neon
-        } else {
-            Self::Baseline
+        match Arch::detect() {
+            #[cfg(target_arch = "x86_64")]
+            Arch::V4 => Self::Avx512,
+            #[cfg(target_arch = "x86_64")]
+            Arch::V3 => Self::Avx2,
+            #[cfg(target_arch = "aarch64")]
+            Arch::NeonFma | Arch::NeonF16 => Self::Neon,
+            _ => Self::Baseline,
         }
     }
 }

@@ -136,7 +136,7 @@ impl TileLists {
         let mut splats = Uncleared::<Splat<T>>::new(listed.len());
         let mut depths = Uncleared::<T>::new(listed.len());
         let mut emitted = |keeps| -> Vec<Emitted> {
-            let emission = Emission::new(packed, opacities, args, keeps);
+            let emission = Emission::new([packed, colors, opacities], args, keeps);
             splats
                 .chunks(CHUNK)
                 .into_par_iter()

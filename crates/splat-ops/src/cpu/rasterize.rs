@@ -9,13 +9,15 @@
 //! ```
 //!
 //! Splats are prepared once per view. A tile is worked on in blocks of four by four pixels, each with the splats whose
-//! ellipse reaches it; both directions go over these in several short passes, of fixed width and without branches, which
-//! the compiler turns into SIMD code for the processor it finds at run time.
+//! ellipse reaches it; both directions go over these in several short passes without branches. The pixels of a block lie in
+//! registers (`pixels.rs`), as wide as those of the processor found at run time.
 
 mod batch;
 mod blend;
 mod gradient;
+mod pixels;
 mod splat;
+mod trace;
 mod work;
 
 use core::any::Any;
@@ -23,6 +25,7 @@ use core::marker::PhantomData;
 use std::sync::Arc;
 
 use burn::backend::flex::FlexTensor;
+use macerator::{Simd, with_simd};
 use rayon::prelude::*;
 use tracing::trace_span;
 
@@ -30,14 +33,15 @@ use super::buffer::{Buffer, tensor, zeros};
 use super::intersect::{CHUNK, Grid, TILE, TileLists};
 use super::parts::{Part, Uncleared};
 use super::real::Real;
-use super::simd::{prefetch, vectorized};
+use super::simd::prefetch;
 use crate::OpError;
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::RasterizeArgs;
-use batch::{GROUP, Reached, by_groups};
+use batch::by_groups;
 use blend::BlendTile;
-use gradient::{GradientTile, MOMENTS, Upstream};
-pub(super) use splat::{NUMBERS, Splat};
+use gradient::{GradientTile, MOMENTS};
+pub(super) use splat::{GROUP, NUMBERS, Splat};
+use trace::Trace;
 pub use work::{RasterizeWork, rasterize_work};
 
 /// So many partial gradients before its turn one is fetched.
@@ -67,8 +71,8 @@ impl State {
 struct Listed<T> {
     lists: TileLists,
     splats: Vec<Splat<T>>,
-    /// D of each splat.
-    colors: Vec<T>,
+    /// Of each splat the channels of its colour that it does not have with it.
+    further_colors: Vec<T>,
     channels: usize,
 }
 
@@ -78,21 +82,22 @@ impl<T: Real> Listed<T> {
         let inputs = [camera.packed, camera.colors, camera.opacities];
         let (lists, splats) = TileLists::new(inputs, args)?;
         let d = camera.channels;
-        let mut colors = Uncleared::<T>::new(lists.listed.len() * d);
-        colors
-            .chunks(CHUNK * d)
+        let further = d.saturating_sub(GROUP);
+        let mut further_colors = Uncleared::<T>::new(lists.listed.len() * further);
+        further_colors
+            .chunks(CHUNK * further)
             .into_par_iter()
             .zip(lists.listed.par_chunks(CHUNK))
             .for_each(|(colors, listed)| {
-                for (color, n) in colors.overwritten().chunks_exact_mut(d).zip(listed) {
-                    let n = *n as usize;
-                    color.copy_from_slice(&camera.colors[n * d..(n + 1) * d]);
+                for (color, n) in colors.overwritten().chunks_exact_mut(further).zip(listed) {
+                    let end = (*n as usize + 1) * d;
+                    color.copy_from_slice(&camera.colors[end - further..end]);
                 }
             });
         Ok(Self {
             lists,
             splats,
-            colors: colors.written(),
+            further_colors: further_colors.written(),
             channels: d,
         })
     }
@@ -106,8 +111,7 @@ impl<T: Real> Listed<T> {
             if first == 0 {
                 // They lie anywhere; those of the next splats follow.
                 if let Some(next) = self.lists.place(i + AHEAD) {
-                    prefetch(partials, Some(next * width));
-                    prefetch(partials, Some((next + 1) * width - 1));
+                    prefetch(partials, next * width..(next + 1) * width);
                 }
             }
             let place = self.lists.place(i).unwrap_or_default();
@@ -137,19 +141,14 @@ impl<T: Real> Listed<T> {
 struct Frame<T> {
     listed: Listed<T>,
     /// By row of tiles.
-    reached: Vec<Reached>,
-    /// `[H, W]`: what is left of the light at each pixel. One minus alpha would lose its digits.
-    transmittance: Vec<T>,
-    /// `[H, W]`: the place, in the list of the pixel's tile, of the splat before which it stopped; `i32::MAX` where it
-    /// did not.
-    stop: Vec<i32>,
+    traces: Vec<Trace<T>>,
 }
 
 /// One camera's splats as the tiles read them.
 struct View<'a, T> {
     lists: &'a TileLists,
     splats: &'a [Splat<T>],
-    colors: &'a [T],
+    further_colors: &'a [T],
     background: Option<&'a [T]>,
     channels: usize,
     width: usize,
@@ -163,7 +162,7 @@ impl<'a, T: Real> View<'a, T> {
         Self {
             lists: &listed.lists,
             splats: &listed.splats,
-            colors: &listed.colors,
+            further_colors: &listed.further_colors,
             background,
             channels: listed.channels,
             width: args.size.width as usize,
@@ -173,11 +172,6 @@ impl<'a, T: Real> View<'a, T> {
         }
     }
 
-    /// Pixels in one row of tiles (the last row of tiles may have fewer).
-    fn slab(&self) -> usize {
-        TILE * self.width
-    }
-
     /// Columns and rows of a tile that lie in the image.
     fn inside(&self, [tx, ty]: [usize; 2]) -> [usize; 2] {
         [
@@ -185,13 +179,6 @@ impl<'a, T: Real> View<'a, T> {
             TILE.min(self.height - ty * TILE),
         ]
     }
-}
-
-/// The pixels of one row of tiles.
-struct Slab<'a, T> {
-    image: &'a mut [T],
-    transmittance: &'a mut [T],
-    stop: &'a mut [i32],
 }
 
 /// The inputs of one camera.
@@ -282,49 +269,31 @@ fn blend<T: Real>(
     image: Vec<Part<T>>,
 ) -> Frame<T> {
     let view = View::new(&listed, background, args);
-    let (slab, pixels) = (view.slab(), view.width * view.height);
-    let mut transmittance = Uncleared::<T>::new(pixels);
-    let mut stop = Uncleared::<i32>::new(pixels);
-    let reached = image
+    let traces = image
         .into_par_iter()
-        .zip(transmittance.chunks(slab))
-        .zip(stop.chunks(slab))
         .enumerate()
         .with_max_len(ROWS_AT_ONCE)
-        .map(|(ty, ((image, transmittance), stop))| {
-            let slab = Slab {
-                image: image.overwritten(),
-                transmittance: transmittance.overwritten(),
-                stop: stop.overwritten(),
-            };
-            blend_row_of_tiles(&view, ty, slab)
-        })
+        .map(|(ty, image)| blend_row_of_tiles(&view, ty, image.overwritten()))
         .collect();
-    Frame {
-        listed,
-        reached,
-        transmittance: transmittance.written(),
-        stop: stop.written(),
-    }
+    Frame { listed, traces }
 }
 
-vectorized! {
-    /// Renders one row of tiles into its part of the image; returns which blocks each splat reaches.
-    fn blend_row_of_tiles<T: Real, const FMA: bool>(
-        view: &View<T>,
-        ty: usize,
-        slab: Slab<T>,
-    ) -> Reached {
-        let mut tile = BlendTile::new(view.channels);
-        let mut slab = slab;
-        let mut reached = Reached::with_capacity(view.lists.row_of_tiles(ty, view.grid).len());
-        for tx in 0..view.grid.columns {
-            let list = view.lists.tile(ty * view.grid.columns + tx);
-            tile.blend::<FMA>(view, list, [tx, ty], &mut reached, &mut ());
-            tile.store(view, [tx, ty], &mut slab);
-        }
-        reached
+/// Renders one row of tiles into its part of the image.
+#[with_simd]
+fn blend_row_of_tiles<'a, S: Simd, T: Real>(
+    view: &View<'a, T>,
+    ty: usize,
+    image: &mut [T],
+) -> Trace<T> {
+    let mut tile = BlendTile::new(view.channels);
+    let splats = view.lists.row_of_tiles(ty, view.grid).len();
+    let mut trace = Trace::with_capacity(view.grid.columns, splats);
+    for tx in 0..view.grid.columns {
+        let list = view.lists.tile(ty * view.grid.columns + tx);
+        tile.blend::<S>(view, list, [tx, ty], &mut trace, &mut ());
+        tile.store::<S>(view, [tx, ty], image);
     }
+    trace
 }
 
 pub(super) fn backward<T: Real>(
@@ -361,11 +330,7 @@ pub(super) fn backward<T: Real>(
     for (index, frame) in state.frames::<T>().iter().enumerate() {
         let background = inputs.camera::<T>(index).background;
         let view = View::new(&frame.listed, background, args);
-        let upstream = Upstream {
-            grad: &grad[index * pixels..(index + 1) * pixels],
-            transmittance: &frame.transmittance,
-            stop: &frame.stop,
-        };
+        let grad = &grad[index * pixels..(index + 1) * pixels];
         // Every (tile, splat) pair writes its own row; each splat then sums its rows in order.
         let width = MOMENTS + d;
         let mut partials = Uncleared::<T>::new(view.lists.instances() * width);
@@ -377,7 +342,7 @@ pub(super) fn backward<T: Real>(
             .with_max_len(ROWS_AT_ONCE)
             .map(|(ty, partials)| {
                 let partials = partials.overwritten();
-                row_of_tiles_backward(&view, &frame.reached[ty], &upstream, ty, partials)
+                row_of_tiles_backward(&view, &frame.traces[ty], grad, ty, partials)
             })
             .collect();
         for row in backgrounds {
@@ -400,30 +365,29 @@ pub(super) fn backward<T: Real>(
     ]
 }
 
-vectorized! {
-    /// Writes the sums of one row of tiles; returns its share of the background's gradient.
-    fn row_of_tiles_backward<T: Real, const FMA: bool>(
-        view: &View<T>,
-        reached: &[u16],
-        upstream: &Upstream<T>,
-        ty: usize,
-        partials: &mut [T],
-    ) -> Vec<T> {
-        let channels = view.channels;
-        let mut background = vec![T::ZERO; channels];
-        let mut tile = GradientTile::new(channels);
-        let (mut reached, mut partials) = (reached, partials);
-        for tx in 0..view.grid.columns {
-            let list = view.lists.tile(ty * view.grid.columns + tx);
-            let length = list.len() * (MOMENTS + channels);
-            let (sums, later) = core::mem::take(&mut partials).split_at_mut(length);
-            let (of_tile, rest) = reached.split_at(list.len());
-            (partials, reached) = (later, rest);
-            tile.load(view, upstream, [tx, ty], &mut background);
-            tile.walk::<FMA>(view, list, [tx, ty], of_tile, sums);
-        }
-        background
+/// Writes the sums of one row of tiles; returns its share of the background's gradient.
+#[with_simd]
+fn row_of_tiles_backward<'a, S: Simd, T: Real>(
+    view: &View<'a, T>,
+    trace: &Trace<T>,
+    grad: &[T],
+    ty: usize,
+    partials: &mut [T],
+) -> Vec<T> {
+    let channels = view.channels;
+    let mut background = vec![T::ZERO; channels];
+    let mut tile = GradientTile::<S, T>::new(channels);
+    let (mut partials, mut first) = (partials, 0);
+    for tx in 0..view.grid.columns {
+        let list = view.lists.tile(ty * view.grid.columns + tx);
+        let length = list.len() * (MOMENTS + channels);
+        let (sums, later) = core::mem::take(&mut partials).split_at_mut(length);
+        let of_tile = trace.tile(tx, first..first + list.len());
+        (partials, first) = (later, first + list.len());
+        tile.load(view, grad, [tx, ty], &of_tile, &mut background);
+        tile.walk(view, list, [tx, ty], &of_tile, sums);
     }
+    background
 }
 
 /// Gradients of up to [`CHUNK`] Gaussians in one camera.
@@ -452,7 +416,7 @@ impl<T: Real> GradientRows<'_, T> {
             packed[3..6].copy_from_slice(&geometry[2..]);
             opacities[row] = of_opacity;
             let colors = &mut colors[row * d..][..d];
-            by_groups!(frame.sum_colors(d, splat, partials, colors));
+            by_groups!(frame.sum_colors(0..d, splat, partials, colors));
         }
     }
 
@@ -460,5 +424,125 @@ impl<T: Real> GradientRows<'_, T> {
         for part in [self.packed, self.colors, self.opacities] {
             part.cleared();
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use macerator::{Arch, WithSimd};
+    use rand::{RngExt, SeedableRng};
+
+    use super::*;
+    use crate::{ErrorSlot, ImageSize};
+
+    const CHANNELS: usize = 5;
+
+    /// Image, what partial gradients each listed splat has in its tiles, and the background's gradient.
+    struct Both<'a, T> {
+        view: &'a View<'a, T>,
+        grad: &'a [T],
+    }
+
+    impl<T: Real> WithSimd for Both<'_, T> {
+        type Output = [Vec<f64>; 3];
+
+        #[inline(always)]
+        fn with_simd<S: Simd>(self) -> Self::Output {
+            let Self { view, grad } = self;
+            let mut image = vec![T::ZERO; grad.len()];
+            let mut partials = vec![T::ZERO; view.lists.instances() * (MOMENTS + CHANNELS)];
+            let mut background = vec![];
+            let slab = TILE * view.width * (CHANNELS + 1);
+            let mut later = &mut *partials;
+            for (ty, image) in image.chunks_mut(slab).enumerate() {
+                let trace = blend_row_of_tiles_impl::<S, T>(view, ty, image);
+                let length = view.lists.row_of_tiles(ty, view.grid).len();
+                let (own, rest) = later.split_at_mut(length * (MOMENTS + CHANNELS));
+                later = rest;
+                let row = row_of_tiles_backward_impl::<S, T>(view, &trace, grad, ty, own);
+                background.extend(row);
+            }
+            let wide = |values: Vec<T>| values.into_iter().map(T::wide).collect();
+            [wide(image), wide(partials), wide(background)]
+        }
+    }
+
+    /// Compares all registers that this processor has, from one number wide on, with each other and a reference; returns what
+    /// the widest give.
+    fn agrees<T: Real>(reference: Option<&[Vec<f64>; 3]>, tolerance: f64) -> [Vec<f64>; 3] {
+        let mut rng = rand_pcg::Pcg64::seed_from_u64(21);
+        let size = ImageSize {
+            width: 37,
+            height: 21,
+        };
+        // Some of the pixels stop in the second batch of their lists, some at none.
+        let count = 400;
+        let (mut packed, mut opacities) = (vec![], vec![]);
+        for depth in 0..count {
+            let mut w = |low: f64, high: f64| rng.random_range(low..high);
+            let (x, y) = (w(-4.0, 41.0), w(-4.0, 25.0));
+            let (w11, w21, w22) = (w(0.05, 0.3), w(-0.1, 0.1), w(0.05, 0.3));
+            packed.extend([x, y, 1.0 + depth as f64, w11, w21, w22, 1.0, 80.0, 80.0]);
+            opacities.push(if depth % 7 == 0 { 1.0 } else { w(0.01, 0.2) });
+        }
+        let mut some = |length: usize| -> Vec<T> {
+            let numbers = (0..length).map(|_| T::of(rng.random_range(0.0..1.0)));
+            numbers.collect()
+        };
+        let (colors, background) = (some(count * CHANNELS), some(CHANNELS));
+        let grad = some(37 * 21 * (CHANNELS + 1));
+        let of = |values: Vec<f64>| -> Vec<T> { values.into_iter().map(T::of).collect() };
+        let (packed, opacities) = (of(packed), of(opacities));
+        let args = RasterizeArgs {
+            size,
+            settings: Default::default(),
+            errors: ErrorSlot::default(),
+        };
+        let camera = Camera {
+            packed: &packed,
+            colors: &colors,
+            opacities: &opacities,
+            background: Some(&background),
+            channels: CHANNELS,
+        };
+        let listed = Listed::new(&camera, &args).unwrap();
+        let view = View::new(&listed, camera.background, &args);
+        assert!(view.lists.tile(0).len() > batch::BATCH);
+
+        let both = || Both {
+            view: &view,
+            grad: &grad,
+        };
+        let best = Arch::detect();
+        let mut sets = vec![best, Arch::Scalar];
+        #[cfg(target_arch = "x86_64")]
+        if matches!(best, Arch::V3 | Arch::V4) {
+            // Whatever runs these runs what came before them.
+            sets.extend([Arch::V2, Arch::V3]);
+        }
+        let mut results = sets.into_iter().map(|set| {
+            // SAFETY: the processor has them.
+            (set, unsafe { set.dispatch(both()) })
+        });
+        let (_, first) = results.next().unwrap();
+        let reference = reference.unwrap_or(&first);
+        for (set, result) in results.chain([(best, first.clone())]) {
+            for (ours, theirs) in result.iter().zip(reference) {
+                assert_eq!(ours.len(), theirs.len());
+                let norm = |values: &mut dyn Iterator<Item = f64>| {
+                    values.map(|value| value * value).sum::<f64>().sqrt()
+                };
+                let error = norm(&mut ours.iter().zip(theirs).map(|(a, b)| a - b));
+                let error = error / norm(&mut theirs.iter().copied());
+                assert!(error < tolerance, "{set:?}: {error:e}");
+            }
+        }
+        first
+    }
+
+    #[test]
+    fn registers_of_any_width_give_the_same_image_and_gradients() {
+        let reference = agrees::<f64>(None, 1e-13);
+        agrees::<f32>(Some(&reference), 2e-5);
     }
 }

@@ -45,21 +45,24 @@ macro_rules! vectorized {
 
 pub(super) use vectorized;
 
-/// Begins to bring an item, if there is one of that index, to the processor's cache.
+/// Begins to bring some items, as far as there are any, to the processor's cache.
 #[inline(always)]
-pub(super) fn prefetch<V>(items: &[V], index: Option<usize>) {
+pub(super) fn prefetch<V>(items: &[V], range: Range<usize>) {
     #[cfg(target_arch = "x86_64")]
-    if let Some(item) = index.and_then(|index| items.get(index)) {
+    if let Some(items) = items.get(range.start..range.end.min(items.len())) {
         use core::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        // Its end may lie in the next line of the cache.
-        let start = core::ptr::from_ref(item).cast::<i8>();
-        for byte in [start, start.wrapping_add(size_of::<V>() - 1)] {
+        /// Bytes of a line of the cache.
+        const LINE: usize = 64;
+        let (start, bytes) = (items.as_ptr().cast::<i8>(), size_of_val(items));
+        // Where lines begin elsewhere, the last one may hold a little more.
+        let last = (align_of::<V>() < LINE).then_some(bytes.saturating_sub(1));
+        for byte in (0..bytes).step_by(LINE).chain(last) {
             // SAFETY: every 64-bit x86 processor has the instruction, which reads nothing.
-            unsafe { _mm_prefetch::<_MM_HINT_T0>(byte) }
+            unsafe { _mm_prefetch::<_MM_HINT_T0>(start.wrapping_add(byte)) }
         }
     }
     #[cfg(not(target_arch = "x86_64"))]
-    let _ = (items, index);
+    let _ = (items, range);
 }
 
 /// Rows that are worked on together. Large enough for any register, small enough for dozens of columns in the first-level

@@ -3,7 +3,7 @@
 //! Splats are worked on side by side, as SIMD code. What depends on a splat, how many rows of tiles it reaches and how many
 //! tiles in each, is no branch wherever it can be avoided: it would be guessed wrongly as often as not.
 
-use super::super::rasterize::{NUMBERS, Splat};
+use super::super::rasterize::{GROUP, NUMBERS, Splat};
 use super::super::real::Real;
 use super::super::simd::{LANES, Lanes, vectorized};
 use super::{Grid, TILE};
@@ -19,6 +19,7 @@ const RUN: usize = 4;
 /// What is the same for all splats of a view.
 pub(super) struct Emission<'a, T> {
     packed: &'a [T],
+    colors: &'a [T],
     opacities: &'a [T],
     alpha_min: T,
     grid: Grid,
@@ -38,13 +39,13 @@ pub(super) struct Emitted {
 impl<'a, T: Real> Emission<'a, T> {
     /// Tiles are only counted, or kept too.
     pub(super) fn new(
-        packed: &'a [T],
-        opacities: &'a [T],
+        [packed, colors, opacities]: [&'a [T]; 3],
         args: &RasterizeArgs,
         keeps: bool,
     ) -> Self {
         Self {
             packed,
+            colors,
             opacities,
             alpha_min: T::of(args.settings.alpha_min),
             grid: Grid::new(args),
@@ -70,7 +71,10 @@ vectorized! {
         let outputs = splats.chunks_mut(LANES).zip(depths.chunks_mut(LANES));
         for (listed, (splats, depths)) in listed.chunks(LANES).zip(outputs) {
             block.load(emission, listed, depths);
-            block.prepare(emission.alpha_min, splats);
+            block.prepare(emission.alpha_min);
+            for (lane, splat) in splats.iter_mut().enumerate() {
+                *splat = block.splat(lane % LANES);
+            }
             let before = emitted.tiles.len();
             block.emit(emission.grid, splats, &mut emitted);
             emitted.pairs += (emitted.tiles.len() - before) as u64;
@@ -88,6 +92,8 @@ struct Block<T> {
     given: [Lanes<T>; 6],
     /// The splats, number by number.
     splats: [Lanes<T>; NUMBERS],
+    /// The first channels of their colours.
+    colors: [[T; GROUP]; LANES],
     /// Half the heights of their ellipses.
     heights: Lanes<T>,
 }
@@ -97,6 +103,7 @@ impl<T: Real> Block<T> {
         Self {
             given: [[T::ZERO; LANES]; 6],
             splats: [[T::ZERO; LANES]; NUMBERS],
+            colors: [[T::ZERO; GROUP]; LANES],
             heights: [T::ZERO; LANES],
         }
     }
@@ -104,6 +111,7 @@ impl<T: Real> Block<T> {
     /// Up to [`LANES`] Gaussians. Lanes beyond hold what they held.
     #[inline(always)]
     fn load(&mut self, emission: &Emission<T>, listed: &[u32], depths: &mut [T]) {
+        let channels = emission.colors.len() / emission.opacities.len().max(1);
         for (lane, (n, depth)) in listed.iter().zip(depths).enumerate() {
             let n = *n as usize;
             let row = &emission.packed[n * PROJECTED_WIDTH..][..PROJECTED_WIDTH];
@@ -113,16 +121,21 @@ impl<T: Real> Block<T> {
             for (column, value) in self.given.iter_mut().zip(given) {
                 column[lane % LANES] = value;
             }
+            let color = &emission.colors[n * channels..(n + 1) * channels];
+            for (channel, value) in self.colors[lane % LANES].iter_mut().zip(color) {
+                *channel = *value;
+            }
         }
     }
 
     #[inline(always)]
     fn splat(&self, lane: usize) -> Splat<T> {
-        Splat::from_numbers(core::array::from_fn(|i| self.splats[i][lane]))
+        let numbers = core::array::from_fn(|i| self.splats[i][lane]);
+        Splat::from_numbers(numbers, self.colors[lane])
     }
 
     #[inline(always)]
-    fn prepare(&mut self, alpha_min: T, splats: &mut [Splat<T>]) {
+    fn prepare(&mut self, alpha_min: T) {
         for lane in 0..LANES {
             let given = core::array::from_fn(|i| self.given[i][lane]);
             let (splat, height) = Splat::new(given, alpha_min);
@@ -131,9 +144,6 @@ impl<T: Real> Block<T> {
                 self.splats[i][lane] = numbers[i];
             }
             self.heights[lane] = height;
-        }
-        for (lane, splat) in splats.iter_mut().enumerate() {
-            *splat = self.splat(lane % LANES);
         }
     }
 
@@ -263,10 +273,11 @@ mod tests {
             opacities.push(rng.random_range(1.0 / 254.0..1.0f64) as f32);
         }
         let listed: Vec<u32> = (0..opacities.len() as u32).collect();
+        let colors: Vec<f32> = (0..2 * listed.len()).map(|i| i as f32).collect();
         let mut splats = vec![Splat::default(); listed.len()];
         let mut depths = vec![0.0; listed.len()];
         let mut emitted = |keeps| {
-            let emission = Emission::new(&packed, &opacities, &args, keeps);
+            let emission = Emission::new([&packed, &colors, &opacities], &args, keeps);
             emit(&emission, &listed, &mut splats, &mut depths)
         };
         let counted = emitted(false);
@@ -275,6 +286,9 @@ mod tests {
         assert_eq!(pairs, tiles.len() as u64);
         assert_eq!(ends.len(), listed.len());
         assert!(depths.iter().all(|depth| *depth == 1.0));
+        for (splat, color) in splats.iter().zip(colors.as_chunks::<2>().0) {
+            assert_eq!(splat.color, [color[0], color[1], 0.0, 0.0]);
+        }
 
         let (mut kept, mut needed, mut first) = (0, 0, 0);
         for ((row, opacity), end) in packed.chunks_exact(9).zip(&opacities).zip(ends) {

@@ -5,30 +5,23 @@ use core::ops::Range;
 use super::super::real::Real;
 use super::super::simd::prefetch;
 use super::View;
-use super::splat::{AHEAD, BLOCKS, Splat};
+use super::splat::{AHEAD, BLOCKS, GROUP, Splat};
 
 /// How many: so many that what is kept of each fits the first-level cache, and few enough for eight bits.
 pub(super) const BATCH: usize = 128;
 
-/// The blocks that every splat reaches in every tile of a row of tiles: found by the forward pass, used again by the
-/// backward. A bit per block, a number per (tile, splat) pair; none from the batch on that found every pixel stopped.
-pub(super) type Reached = Vec<u16>;
-
-/// So many channels are worked on at once.
-pub(super) const GROUP: usize = 4;
-
-/// Calls a method for all channels, a few at a time and of a number that the compiler knows, which unrolls its loops:
-/// `method::<FMA, COUNT>(first, ...)`.
+/// Calls a method for some channels, a few at a time and of a number that the compiler knows, which unrolls its loops:
+/// `method::<S, COUNT>(first, ...)`.
 macro_rules! by_groups {
-    ($this:ident.$method:ident$(::<$fma:ident>)?($channels:ident $(, $argument:expr)*)) => {{
-        let mut first = 0;
-        while first < $channels {
-            let count = GROUP.min($channels - first);
+    ($this:ident.$method:ident$(::<$simd:ident>)?($first:tt..$end:ident $(, $argument:expr)*)) => {{
+        let mut first = $first;
+        while first < $end {
+            let count = GROUP.min($end - first);
             match count {
-                1 => $this.$method::<$($fma,)? 1>(first $(, $argument)*),
-                2 => $this.$method::<$($fma,)? 2>(first $(, $argument)*),
-                3 => $this.$method::<$($fma,)? 3>(first $(, $argument)*),
-                _ => $this.$method::<$($fma,)? GROUP>(first $(, $argument)*),
+                1 => $this.$method::<$($simd,)? 1>(first $(, $argument)*),
+                2 => $this.$method::<$($simd,)? 2>(first $(, $argument)*),
+                3 => $this.$method::<$($simd,)? 3>(first $(, $argument)*),
+                _ => $this.$method::<$($simd,)? GROUP>(first $(, $argument)*),
             }
             first += count;
         }
@@ -37,20 +30,23 @@ macro_rules! by_groups {
 
 pub(super) use by_groups;
 
+/// As many as there are places of eight bits, so that no place needs a check.
+pub(super) type ByPlace<V> = [V; 1 << u8::BITS];
+
 /// The splats, side by side.
-// Arrays of a fixed size, so that no place needs a check.
 pub(super) struct Batch<T> {
-    splats: Box<[Splat<T>; BATCH]>,
-    /// By group of channels.
-    colors: Vec<[[T; GROUP]; BATCH]>,
+    splats: Box<ByPlace<Splat<T>>>,
+    /// By group of channels, from the second one on.
+    further_colors: Vec<ByPlace<[T; GROUP]>>,
     pub(super) places: Places,
 }
 
 impl<T: Real> Batch<T> {
     pub(super) fn new(channels: usize) -> Self {
+        let further = channels.saturating_sub(GROUP).div_ceil(GROUP);
         Self {
-            splats: Box::new([Splat::default(); BATCH]),
-            colors: vec![[[T::ZERO; GROUP]; BATCH]; channels.div_ceil(GROUP)],
+            splats: Box::new([Splat::default(); _]),
+            further_colors: vec![[[T::ZERO; GROUP]; _]; further],
             places: Places::new(),
         }
     }
@@ -59,20 +55,24 @@ impl<T: Real> Batch<T> {
     #[inline(always)]
     pub(super) fn gather(&mut self, view: &View<T>, list: &[u32]) -> &[Splat<T>] {
         for (place, (splat, index)) in self.splats.iter_mut().zip(list).enumerate() {
-            let next = list.get(place + AHEAD).map(|index| *index as usize);
-            prefetch(view.splats, next);
-            prefetch(view.colors, next.map(|index| index * view.channels));
+            if let Some(next) = list.get(place + AHEAD) {
+                prefetch(view.splats, *next as usize..*next as usize + 1);
+            }
             *splat = view.splats[*index as usize];
         }
         let channels = view.channels;
-        by_groups!(self.gather_colors(channels, view, list));
+        by_groups!(self.gather_colors(GROUP..channels, view, list));
         &self.splats[..list.len()]
     }
 
+    /// Some of the channels that a splat does not have with it.
     #[inline(always)]
     fn gather_colors<const COUNT: usize>(&mut self, first: usize, view: &View<T>, list: &[u32]) {
-        for (batched, index) in self.colors[first / GROUP].iter_mut().zip(list) {
-            let colors = &view.colors[*index as usize * view.channels + first..][..COUNT];
+        let width = view.channels - GROUP;
+        let colors = &mut self.further_colors[first / GROUP - 1];
+        for (batched, index) in colors.iter_mut().zip(list) {
+            let at = *index as usize * width + first - GROUP;
+            let colors = &view.further_colors[at..at + COUNT];
             batched[..COUNT].copy_from_slice(colors);
         }
     }
@@ -91,15 +91,19 @@ impl<T: Real> Batch<T> {
 
     #[inline(always)]
     pub(super) fn splat(&self, place: u8) -> Splat<T> {
-        self.splats[usize::from(place) % BATCH]
+        self.splats[usize::from(place)]
     }
 
     /// Some channels of their colours, from a first one on.
     #[inline(always)]
     pub(super) fn colors(&self, block: usize, first: usize) -> impl Iterator<Item = [T; GROUP]> {
-        let colors = &self.colors[first / GROUP];
         let places = self.places.of(block).iter();
-        places.map(|place| colors[usize::from(*place) % BATCH])
+        let further = (first / GROUP).checked_sub(1);
+        let further = further.map(|group| &self.further_colors[group]);
+        places.map(move |place| match further {
+            None => self.splat(*place).color,
+            Some(colors) => colors[usize::from(*place)],
+        })
     }
 }
 

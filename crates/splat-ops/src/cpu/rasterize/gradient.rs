@@ -1,11 +1,13 @@
 //! Walks the splats of a tile back to front and collects their gradients.
 //!
 //! ```text
-//! d alpha = T (c . grad) - behind / (1 - alpha)
-//! g = d sigma = -raw d alpha = raw (behind - T' (c . grad)) / (1 - alpha)     (0 at the cap)
+//! d alpha = T (c . grad - B)
+//! g = d sigma = -raw d alpha = alpha T (B - c . grad)     (0 at the cap)
 //! ```
 //!
-//! T being the transmittance in front of the splat, and T' = (1 - alpha) T that behind it.
+//! T being the transmittance in front of the splat, and B what its pixel shows behind it, as the loss sees it, were there
+//! nothing in front: `B = background . grad - grad of alpha` behind the last splat, and `B (1 - alpha) + (c . grad) alpha` in
+//! front of each. T is found front to back, as when blending, so nothing is ever divided by one less alpha.
 //!
 //! Everything that a splat's shape needs is six sums over its pixels, of g times 1, z1, z2, z1^2, z1 z2 and z2^2. z is of
 //! the order of one wherever the splat is seen, so nothing cancels, however thin or far away it is. With dx = z1 / w11
@@ -19,193 +21,230 @@
 
 use core::ops::Range;
 
+use macerator::{Simd, Vector};
+
 use super::super::intersect::TILE;
 use super::super::real::Real;
 use super::super::simd::prefetch;
 use super::View;
-use super::batch::{BATCH, Batch, GROUP, by_groups};
+use super::batch::{BATCH, Batch, ByPlace, by_groups};
+use super::pixels::{Columns, Pixels, four_totals, load_each, total};
 use super::splat::{
-    Aligned, BLOCKS, Centres, HALF, Half, LANES, Lanes, SIDE, Thresholds, corner, in_blocks,
-    squares,
+    ACROSS, Aligned, BLOCKS, Centres, GROUP, LANES, Lanes, SIDE, Thresholds, corner, row_mut,
+    square,
 };
+use super::trace::{ByBlock, TileTrace};
 
 /// Sums per splat before those of its D colours.
 pub(super) const MOMENTS: usize = 6;
 
-/// Per-pixel data of one camera that the backward starts from.
-pub(super) struct Upstream<'a, T> {
-    pub(super) grad: &'a [T],
-    pub(super) transmittance: &'a [T],
-    pub(super) stop: &'a [i32],
-}
-
 /// The pixels of a tile while they are walked back to front, by block.
-pub(super) struct GradientTile<T> {
-    /// Transmittance behind the splats walked so far; in front of them after the next one.
-    transmittance: [Aligned<Lanes<T>>; BLOCKS],
-    /// What lies behind, as the loss sees it: sum of (c . grad) alpha T over the splats behind, plus
-    /// the final transmittance times (background . grad - grad of alpha).
-    behind: [Aligned<Lanes<T>>; BLOCKS],
-    /// The place of the splat before which the pixel stopped.
-    stop: [Aligned<Lanes<i32>>; BLOCKS],
+pub(super) struct GradientTile<S: Simd, T: Real> {
+    /// B, behind the splats that are still to come.
+    behind: ByBlock<T>,
     /// D of each block: gradient of the image.
     grad: Vec<Aligned<Lanes<T>>>,
-    centres: [Centres<T>; BLOCKS],
     batch: Batch<T>,
     /// Of every splat that reaches the block at hand.
     pairs: Vec<Aligned<Pairs<T>>>,
-    /// `MOMENTS + D` sums of each splat of the batch, each in parts that are added last.
-    sums: Vec<Aligned<Half<T>>>,
+    /// c . grad of the same, of channels beyond the first group.
+    toward: Vec<Aligned<Lanes<T>>>,
+    /// Sums of each splat of the batch, whose lanes are added last: the moments and the first group of channels.
+    sums: Box<ByPlace<Sums<S, T>>>,
+    /// Likewise of the further channels.
+    further_sums: Vec<Vector<S, T>>,
 }
+
+/// By fours, to which they are added up.
+type Sums<S, T> = Aligned<[Vector<S, T>; (MOMENTS + GROUP).next_multiple_of(4)]>;
 
 /// A splat and each pixel of a block.
 #[derive(Clone, Copy)]
 struct Pairs<T> {
-    /// Of the upper and of the lower half.
-    z1: Half<T>,
-    z2: [Half<T>; 2],
-    /// `|z|^2`, then the falloff, and then g.
-    falloff: Lanes<T>,
-    /// c . grad, and then the splat's weight.
-    toward: Lanes<T>,
+    /// By column.
+    z1: Lanes<T>,
+    z2: Lanes<T>,
+    /// `|z|^2`, and then alpha where the splat is blended, 0 elsewhere.
+    share: Lanes<T>,
+    /// The share of the pixel's light that the splat sends, alpha T.
+    weight: Lanes<T>,
 }
 
-impl<T: Real> GradientTile<T> {
+impl<S: Simd, T: Real> GradientTile<S, T> {
     pub(super) fn new(channels: usize) -> Self {
         let none = [T::ZERO; LANES];
         let pairs = Pairs {
-            z1: [T::ZERO; HALF],
-            z2: [[T::ZERO; HALF]; 2],
-            falloff: none,
-            toward: none,
+            z1: none,
+            z2: none,
+            share: none,
+            weight: none,
         };
+        let further = channels.saturating_sub(GROUP);
         Self {
-            transmittance: [Aligned([T::ONE; LANES]); BLOCKS],
             behind: [Aligned(none); BLOCKS],
-            stop: [Aligned([0; LANES]); BLOCKS],
             grad: vec![Aligned(none); channels * BLOCKS],
-            centres: Centres::of_blocks(),
             batch: Batch::new(channels),
             pairs: vec![Aligned(pairs); BATCH],
-            sums: vec![Aligned([T::ZERO; HALF]); BATCH * (MOMENTS + channels)],
+            toward: vec![Aligned(none); if further > 0 { BATCH } else { 0 }],
+            sums: Box::new([Aligned([T::ZERO.splat(); _]); _]),
+            further_sums: vec![T::ZERO.splat(); BATCH * further],
         }
     }
 
-    /// Reads the tile's pixels, and adds its share of the background's gradient, `sum of T_final grad`, if there is one.
-    /// Pixels outside of the image have blended nothing.
+    /// Reads the gradient of the tile's pixels, and adds its share of the background's gradient, `sum of T_final grad`, if there
+    /// is one.
     #[inline(always)]
     pub(super) fn load(
         &mut self,
         view: &View<T>,
-        upstream: &Upstream<T>,
+        grad: &[T],
         [tx, ty]: [usize; 2],
+        trace: &TileTrace<T>,
         background: &mut [T],
     ) {
         let [columns, rows] = view.inside([tx, ty]);
         if [columns, rows] != [TILE; 2] {
-            self.transmittance = [Aligned([T::ONE; LANES]); BLOCKS];
+            // Nobody looks at pixels outside of the image.
             self.behind = [Aligned([T::ZERO; LANES]); BLOCKS];
-            self.stop = [Aligned([0; LANES]); BLOCKS];
             self.grad.fill(Aligned([T::ZERO; LANES]));
         }
+        let depth = view.channels + 1;
         for row in 0..rows {
-            for column in (0..columns).step_by(SIDE) {
-                let to = in_blocks(column, row);
-                let pixel = (ty * TILE + row) * view.width + tx * TILE + column;
-                // With numbers that the compiler knows, loops are unrolled.
-                match (view.channels, columns - column) {
-                    (3, SIDE..) => self.load_row(view, upstream, pixel, to, 3, SIDE, background),
-                    (d, width) => {
-                        let width = width.min(SIDE);
-                        self.load_row(view, upstream, pixel, to, d, width, background);
+            let first = (ty * TILE + row) * view.width + tx * TILE;
+            // The same row of the next tile, which lies anywhere.
+            prefetch(grad, (first + TILE) * depth..(first + 2 * TILE) * depth);
+            self.load_row(
+                row,
+                &grad[first * depth..(first + columns) * depth],
+                view.channels,
+            );
+        }
+        self.begin(view, trace, background);
+    }
+
+    /// Reads a row of the tile; gradients of alpha take the place of B.
+    #[inline(always)]
+    fn load_row(&mut self, row: usize, grad: &[T], channels: usize) {
+        let blocks = self.grad.chunks_exact_mut(channels).zip(&mut self.behind);
+        let blocks = blocks.skip(row / SIDE * ACROSS);
+        for (grad, (planes, behind)) in grad.chunks(SIDE * (channels + 1)).zip(blocks) {
+            let of_alpha = row_mut(&mut behind.0, row % SIDE);
+            match (planes, grad.as_chunks::<4>().0.as_array::<SIDE>()) {
+                // Pixels of four numbers, of which as many are read at once.
+                ([red, green, blue], Some(grad)) => {
+                    let [of_red, of_green, of_blue, alpha] = T::transposed(*grad);
+                    *row_mut(&mut red.0, row % SIDE) = of_red;
+                    *row_mut(&mut green.0, row % SIDE) = of_green;
+                    *row_mut(&mut blue.0, row % SIDE) = of_blue;
+                    *of_alpha = alpha;
+                }
+                (planes, _) => {
+                    for (i, grad) in grad.chunks_exact(channels + 1).enumerate() {
+                        for (plane, grad) in planes.iter_mut().zip(grad) {
+                            row_mut(&mut plane.0, row % SIDE)[i] = *grad;
+                        }
+                        of_alpha[i] = grad[channels];
                     }
                 }
             }
         }
     }
 
-    /// Reads some pixels of a row of a block.
+    /// B behind the last splat of every pixel, and what the background's gradient gets of the tile.
     #[inline(always)]
-    fn load_row(
-        &mut self,
-        view: &View<T>,
-        upstream: &Upstream<T>,
-        pixel: usize,
-        [block, lane]: [usize; 2],
-        channels: usize,
-        width: usize,
-        background: &mut [T],
-    ) {
-        // The same rows of the next tile, which lie anywhere.
-        let next = pixel + TILE;
-        prefetch(upstream.grad, Some(next * (channels + 1)));
-        prefetch(upstream.transmittance, Some(next));
-        prefetch(upstream.stop, Some(next));
-        let pixels = pixel..pixel + width;
-        let (left, stop) = (
-            &upstream.transmittance[pixels.clone()],
-            &upstream.stop[pixels],
-        );
-        let grad = &upstream.grad[pixel * (channels + 1)..][..width * (channels + 1)];
-        let planes = &mut self.grad[block * channels..][..channels];
-        let mut behind = [T::ZERO; SIDE];
-        for i in 0..width {
-            behind[i] = -grad[i * (channels + 1) + channels];
-        }
-        for channel in 0..channels {
-            for i in 0..width {
-                planes[channel].0[lane + i] = grad[i * (channels + 1) + channel];
-            }
-            if let Some(color) = view.background {
-                for i in 0..width {
-                    let grad = grad[i * (channels + 1) + channel];
-                    behind[i] += color[channel] * grad;
-                    background[channel] += left[i] * grad;
+    fn begin(&mut self, view: &View<T>, trace: &TileTrace<T>, background: &mut [T]) {
+        let zero = Pixels::<S, T>::splat(T::ZERO);
+        let colors = view.background.zip(trace.transmittance.last());
+        for (block, Aligned(behind)) in self.behind.iter_mut().enumerate() {
+            let mut sum = zero.minus(Pixels::load(behind));
+            if let Some((colors, left)) = colors {
+                let left = Pixels::load(&left[block].0);
+                let grads = &self.grad[block * view.channels..];
+                for ((grad, color), share) in grads.iter().zip(colors).zip(&mut *background) {
+                    let grad = Pixels::load(&grad.0);
+                    sum = grad.times_plus(Pixels::splat(*color), sum);
+                    let mut of_background = T::ZERO.splat();
+                    left.times_add_to(grad, &mut of_background);
+                    *share += total(of_background);
                 }
             }
-        }
-        for i in 0..width {
-            self.transmittance[block].0[lane + i] = left[i];
-            self.behind[block].0[lane + i] = left[i] * behind[i];
-            self.stop[block].0[lane + i] = stop[i];
+            sum.store(behind);
         }
     }
 
     /// Walks the list back to front and writes the sums of each splat over the tile, `MOMENTS + D` values. The splats
     /// reach the blocks that the forward pass found.
     #[inline(always)]
-    pub(super) fn walk<const FMA: bool>(
+    pub(super) fn walk(
         &mut self,
         view: &View<T>,
         list: &[u32],
         tile: [usize; 2],
-        reached: &[u16],
+        trace: &TileTrace<T>,
         partials: &mut [T],
     ) {
         let channels = view.channels;
-        let width = MOMENTS + channels;
         let thresholds = Thresholds::<T>::new(view.args);
         let corner = corner(tile);
-        let batches = list.chunks(BATCH).zip(reached.chunks(BATCH));
-        let batches = batches.zip(partials.chunks_mut(BATCH * width));
+        let batches = list.chunks(BATCH).zip(trace.reached.chunks(BATCH));
+        let batches = batches.zip(partials.chunks_mut(BATCH * (MOMENTS + channels)));
         for (number, ((list, reached), partials)) in batches.enumerate().rev() {
             self.batch.gather(view, list);
             self.batch.places.fill(reached);
-            self.sums[..list.len() * width].fill(Aligned([T::ZERO; HALF]));
+            self.clear_sums(list.len(), channels);
             let first = (number * BATCH) as i32;
             for block in 0..BLOCKS {
-                let [open, count] = self.counts(block, first);
-                if count > 0 {
-                    self.evaluate::<FMA>(block, count, corner);
-                    by_groups!(self.look::<FMA>(channels, channels, block, count));
-                    self.step::<FMA, true>(block, open..count, first, &thresholds);
-                    self.step::<FMA, false>(block, 0..open, first, &thresholds);
-                    self.add_moments::<FMA>(block, count, width);
-                    by_groups!(self.add_colors::<FMA>(channels, channels, block, count));
+                let stop = &trace.stop[block].0;
+                let [open, count] = self.counts(block, first, stop);
+                if count == 0 {
+                    continue;
                 }
+                // In front of the first batch there is all light.
+                let before = number.checked_sub(1);
+                let before = before.and_then(|before| trace.transmittance.get(before));
+                let before = before.map(|before| &before[block].0);
+                self.evaluate(block, count, corner);
+                self.share::<false>(block, 0..open, first, stop, &thresholds);
+                self.share::<true>(block, open..count, first, stop, &thresholds);
+                self.weigh(count, before.unwrap_or(&[T::ONE; LANES]));
+                by_groups!(self.look(GROUP..channels, channels, block, count));
+                match channels {
+                    1 => self.step::<1, false>(block, count, channels, &thresholds),
+                    2 => self.step::<2, false>(block, count, channels, &thresholds),
+                    3 => self.step::<3, false>(block, count, channels, &thresholds),
+                    GROUP => self.step::<GROUP, false>(block, count, channels, &thresholds),
+                    _ => self.step::<GROUP, true>(block, count, channels, &thresholds),
+                }
+                by_groups!(self.add_colors(GROUP..channels, channels, block, count));
             }
-            for (out, Aligned(parts)) in partials.iter_mut().zip(&self.sums) {
-                *out = total(parts);
+            self.write_sums(channels, partials);
+        }
+    }
+
+    #[inline(always)]
+    fn clear_sums(&mut self, splats: usize, channels: usize) {
+        let zero = T::ZERO.splat();
+        for Aligned(sums) in &mut self.sums[..splats] {
+            *sums = [zero; _];
+        }
+        self.further_sums[..splats * channels.saturating_sub(GROUP)].fill(zero);
+    }
+
+    #[inline(always)]
+    fn write_sums(&self, channels: usize, partials: &mut [T]) {
+        let together = MOMENTS + channels.min(GROUP);
+        let further = channels.saturating_sub(GROUP);
+        let partials = partials.chunks_exact_mut(MOMENTS + channels);
+        for (place, (partials, Aligned(sums))) in partials.zip(&*self.sums).enumerate() {
+            let (first, rest) = partials.split_at_mut(together);
+            let mut totals = [[T::ZERO; 4]; 3];
+            for (totals, sums) in totals.iter_mut().zip(sums.as_chunks().0) {
+                *totals = four_totals(*sums);
+            }
+            first.copy_from_slice(&totals.as_flattened()[..together]);
+            let sums = &self.further_sums[place * further..][..further];
+            for (out, sum) in rest.iter_mut().zip(sums) {
+                *out = total(*sum);
             }
         }
     }
@@ -213,8 +252,7 @@ impl<T: Real> GradientTile<T> {
     /// How many splats of the batch, which begins at a place of the list, reach a block before its first pixel stopped, and
     /// before its last one did.
     #[inline(always)]
-    fn counts(&self, block: usize, first: i32) -> [usize; 2] {
-        let stop = self.stop[block].0;
+    fn counts(&self, block: usize, first: i32, stop: &Lanes<i32>) -> [usize; 2] {
         let places = self.batch.places.of(block);
         let end = first + BATCH as i32;
         // Most pixels never stop. One loop that always ends, as SIMD code.
@@ -223,173 +261,177 @@ impl<T: Real> GradientTile<T> {
         }
         let (mut soonest, mut last) = (i32::MAX, 0);
         for stop in stop {
-            (soonest, last) = (soonest.min(stop), last.max(stop));
+            (soonest, last) = (soonest.min(*stop), last.max(*stop));
         }
         let before = |stop| places.partition_point(|place| first + i32::from(*place) < stop);
         [before(soonest), before(last)]
     }
 
-    /// Falloffs of the first splats that reach a block.
+    /// z and its square of the first splats that reach a block.
     #[inline(always)]
-    fn evaluate<const FMA: bool>(&mut self, block: usize, count: usize, corner: [T; 2]) {
-        let Centres { x, y } = self.centres[block].beyond(corner);
+    fn evaluate(&mut self, block: usize, count: usize, corner: [T; 2]) {
+        let centres = Centres::<S, T>::new(block, corner);
         let pairs = &mut self.pairs[..count];
         for (Aligned(pairs), splat) in pairs.iter_mut().zip(self.batch.reaching(block, 0..count)) {
-            for i in 0..HALF {
-                let (z1, z2) = splat.z::<FMA>(x[i], [y[0][i], y[1][i]]);
-                pairs.z1[i] = z1;
-                [pairs.z2[0][i], pairs.z2[1][i]] = z2;
-                [pairs.falloff[i], pairs.falloff[HALF + i]] = squares::<T, FMA>(z1, z2);
-            }
-        }
-        // By themselves, so that all that an exponential needs stays in registers.
-        for Aligned(pairs) in pairs {
-            for i in 0..LANES {
-                pairs.falloff[i] = T::exp2_neg::<FMA>(pairs.falloff[i]);
-            }
+            let (z1, z2) = splat.z(&centres);
+            z1.store(&mut pairs.z1);
+            z2.store(&mut pairs.z2);
+            square(z1, z2).store(&mut pairs.share);
         }
     }
 
-    /// What the loss thinks of the splats' colours at every pixel, c . grad.
+    /// Shares of some of the splats. `STOPS` if a pixel may have stopped before one of them.
+    // By themselves: the processor looks only so far ahead for other pairs to work on, and an exponential is long.
     #[inline(always)]
-    fn look<const FMA: bool, const COUNT: usize>(
-        &mut self,
-        first: usize,
-        channels: usize,
-        block: usize,
-        count: usize,
-    ) {
-        let planes = &self.grad[block * channels + first..][..COUNT];
-        let grads: [Lanes<T>; COUNT] = core::array::from_fn(|i| planes[i].0);
-        let colors = self.batch.colors(block, first);
-        for (Aligned(pairs), colors) in self.pairs[..count].iter_mut().zip(colors) {
-            let mut toward = if first == 0 {
-                [T::ZERO; LANES]
-            } else {
-                pairs.toward
-            };
-            for (grad, color) in grads.iter().zip(colors) {
-                for i in 0..LANES {
-                    toward[i] = T::multiply_add::<FMA>(color, grad[i], toward[i]);
-                }
-            }
-            pairs.toward = toward;
-        }
-    }
-
-    /// Steps in front of some of the splats, the last one first: their weights and g. `STOPS` if a pixel may have stopped
-    /// before one of them.
-    #[inline(always)]
-    fn step<const FMA: bool, const STOPS: bool>(
+    fn share<const STOPS: bool>(
         &mut self,
         block: usize,
         splats: Range<usize>,
         first: i32,
+        stop: &Lanes<i32>,
         thresholds: &Thresholds<T>,
     ) {
-        let (mut transmittance, mut behind) = (self.transmittance[block].0, self.behind[block].0);
-        let stop = self.stop[block].0;
+        let gate = Pixels::<S, T>::splat(thresholds.alpha_min);
+        // From the first place on, where numbers are small.
+        let until = stop.map(|stop| {
+            let until = stop.saturating_sub(first).clamp(0, BATCH as i32);
+            T::of_index(until)
+        });
+        let until = Pixels::load(&until);
         let places = &self.batch.places.of(block)[splats.clone()];
-        let reaching = self.batch.reaching(block, splats.clone()).zip(places);
-        for (Aligned(pairs), (splat, place)) in self.pairs[splats].iter_mut().zip(reaching).rev() {
-            let (raw, toward) = (splat.raw(&pairs.falloff), pairs.toward);
-            let place = first + i32::from(*place);
-            let [mut weights, mut gs] = [[T::ZERO; LANES]; 2];
-            for i in 0..LANES {
-                let blended = thresholds.seen(raw[i]) & (!STOPS | (place < stop[i]));
-                // Every store is unconditional: masked ones are slow. Without a share nothing changes, exactly.
-                let share = if blended {
-                    thresholds.alpha(raw[i])
-                } else {
-                    T::ZERO
-                };
-                let inverse = T::ONE / (T::ONE - share);
-                // The T in front is that behind times `inverse`.
-                let g = T::multiply_add::<FMA>(-transmittance[i], toward[i], behind[i]);
-                let g = raw[i] * inverse * g;
-                let live = blended & !thresholds.capped(raw[i]);
-                gs[i] = if live { g } else { T::ZERO };
-                transmittance[i] = transmittance[i] * inverse;
-                weights[i] = share * transmittance[i];
-                behind[i] = T::multiply_add::<FMA>(weights[i], toward[i], behind[i]);
+        for (Aligned(pairs), place) in self.pairs[splats].iter_mut().zip(places) {
+            let falloffs = Pixels::load(&pairs.share).exp2_neg();
+            let raw = self.batch.splat(*place).raw(falloffs);
+            let mut share = thresholds.share(raw, gate);
+            if STOPS {
+                let place = Pixels::splat(T::of_index(i32::from(*place)));
+                share = share.where_below(place, until);
             }
-            (pairs.falloff, pairs.toward) = (gs, weights);
-        }
-        (self.transmittance[block].0, self.behind[block].0) = (transmittance, behind);
-    }
-
-    /// Adds a block's g times 1, z1, z2, z1^2, z1 z2 and z2^2.
-    #[inline(always)]
-    fn add_moments<const FMA: bool>(&mut self, block: usize, count: usize, width: usize) {
-        let places = self.batch.places.of(block);
-        for (Aligned(pairs), place) in self.pairs[..count].iter().zip(places) {
-            let sums = &mut self.sums[usize::from(*place) * width..][..MOMENTS];
-            let mut parts: [Half<T>; MOMENTS] = core::array::from_fn(|i| sums[i].0);
-            let Pairs {
-                z1, z2, falloff: g, ..
-            } = *pairs;
-            for i in 0..HALF {
-                // z1 is that of both halves.
-                let (upper, lower) = (g[i], g[HALF + i]);
-                let (upper2, lower2) = (upper * z2[0][i], lower * z2[1][i]);
-                let (one, two) = (upper + lower, upper2 + lower2);
-                let one1 = one * z1[i];
-                parts[0][i] += one;
-                parts[1][i] += one1;
-                parts[2][i] += two;
-                parts[3][i] = T::multiply_add::<FMA>(one1, z1[i], parts[3][i]);
-                parts[4][i] = T::multiply_add::<FMA>(two, z1[i], parts[4][i]);
-                parts[5][i] = T::multiply_add::<FMA>(upper2, z2[0][i], parts[5][i]);
-                parts[5][i] = T::multiply_add::<FMA>(lower2, z2[1][i], parts[5][i]);
-            }
-            for (sum, parts) in sums.iter_mut().zip(parts) {
-                sum.0 = parts;
-            }
+            share.store(&mut pairs.share);
         }
     }
 
-    /// Adds a block's weights times the gradient of the image.
+    /// Weights of the first splats that reach a block, front to back, given the transmittance in front of them.
     #[inline(always)]
-    fn add_colors<const FMA: bool, const COUNT: usize>(
+    fn weigh(&mut self, count: usize, before: &Lanes<T>) {
+        let mut before = Pixels::<S, T>::load(before);
+        for Aligned(pairs) in &mut self.pairs[..count] {
+            let share = Pixels::load(&pairs.share);
+            share.times(before).store(&mut pairs.weight);
+            before = share.times_from(before, before);
+        }
+    }
+
+    /// What the loss thinks of some further channels of the splats' colours at every pixel, c . grad.
+    #[inline(always)]
+    fn look<const COUNT: usize>(
         &mut self,
         first: usize,
         channels: usize,
         block: usize,
         count: usize,
     ) {
-        let planes = &self.grad[block * channels + first..][..COUNT];
-        let grads: [Lanes<T>; COUNT] = core::array::from_fn(|i| planes[i].0);
-        let width = MOMENTS + channels;
+        let grads = self.grads::<COUNT>(block * channels + first);
+        let colors = self.batch.colors(block, first);
+        for (Aligned(toward), color) in self.toward[..count].iter_mut().zip(colors) {
+            let before = match first {
+                GROUP => Pixels::splat(T::ZERO),
+                _ => Pixels::load(toward),
+            };
+            dot(&grads, &color, before).store(toward);
+        }
+    }
+
+    /// Gradient of some channels of a block's pixels.
+    #[inline(always)]
+    fn grads<const COUNT: usize>(&self, first: usize) -> [Pixels<S, T>; COUNT] {
+        load_each(&self.grad[first..])
+    }
+
+    /// Steps in front of the first splats that reach a block, the last one first, and adds what they get to their sums: their
+    /// moments and the first group of channels. Whether there are `MORE` channels.
+    #[inline(always)]
+    fn step<const COUNT: usize, const MORE: bool>(
+        &mut self,
+        block: usize,
+        count: usize,
+        channels: usize,
+        thresholds: &Thresholds<T>,
+    ) {
+        let mut behind = Pixels::<S, T>::load(&self.behind[block].0);
+        let grads = self.grads::<COUNT>(block * channels);
+        let places = self.batch.places.of(block);
+        let pairs = self.pairs[..count].iter().zip(places).enumerate();
+        for (number, (Aligned(pairs), place)) in pairs.rev() {
+            let further = match MORE {
+                true => Pixels::load(&self.toward[number].0),
+                false => Pixels::splat(T::ZERO),
+            };
+            let toward = dot(&grads, &self.batch.splat(*place).color, further);
+            let (share, weight) = (Pixels::load(&pairs.share), Pixels::load(&pairs.weight));
+            let difference = behind.minus(toward);
+            let g = thresholds.below_cap(weight.times(difference), share);
+            behind = share.times_from(difference, behind);
+
+            let Aligned(sums) = &mut self.sums[usize::from(*place)];
+            let (moments, of_colors) = sums.split_at_mut(MOMENTS);
+            add_moments(g, pairs, moments);
+            for (sum, grad) in of_colors.iter_mut().zip(grads) {
+                weight.times_add_to(grad, sum);
+            }
+        }
+        behind.store(&mut self.behind[block].0);
+    }
+
+    /// Adds a block's weights times the gradient of some further channels.
+    #[inline(always)]
+    fn add_colors<const COUNT: usize>(
+        &mut self,
+        first: usize,
+        channels: usize,
+        block: usize,
+        count: usize,
+    ) {
+        let grads = self.grads::<COUNT>(block * channels + first);
         let places = self.batch.places.of(block);
         for (Aligned(pairs), place) in self.pairs[..count].iter().zip(places) {
-            let at = usize::from(*place) * width + MOMENTS + first;
-            let sums = &mut self.sums[at..at + COUNT];
-            let weights = pairs.toward;
-            for (sum, grad) in sums.iter_mut().zip(&grads) {
-                let mut parts = sum.0;
-                for half in [0, HALF] {
-                    for part in 0..HALF {
-                        let (weight, grad) = (weights[half + part], grad[half + part]);
-                        parts[part] = T::multiply_add::<FMA>(weight, grad, parts[part]);
-                    }
-                }
-                sum.0 = parts;
+            let at = usize::from(*place) * (channels - GROUP) + first - GROUP;
+            let weight = Pixels::load(&pairs.weight);
+            for (sum, grad) in self.further_sums[at..at + COUNT].iter_mut().zip(grads) {
+                weight.times_add_to(grad, sum);
             }
         }
     }
 }
 
-/// Sum of the parts: halves are added to halves.
+/// `sum + c . grad` of some channels.
 #[inline(always)]
-fn total<T: Real>(parts: &Half<T>) -> T {
-    let (mut sums, mut width) = (*parts, parts.len());
-    while width > 1 {
-        width /= 2;
-        for i in 0..width {
-            sums[i] += sums[i + width];
-        }
+fn dot<S: Simd, T: Real, const COUNT: usize>(
+    grads: &[Pixels<S, T>; COUNT],
+    color: &[T; GROUP],
+    sum: Pixels<S, T>,
+) -> Pixels<S, T> {
+    let mut sum = sum;
+    for (grad, color) in grads.iter().zip(color) {
+        sum = grad.times_plus(Pixels::splat(*color), sum);
     }
-    sums[0]
+    sum
+}
+
+/// Adds a block's g times 1, z1, z2, z1^2, z1 z2 and z2^2.
+#[inline(always)]
+fn add_moments<S: Simd, T: Real>(g: Pixels<S, T>, pairs: &Pairs<T>, sums: &mut [Vector<S, T>]) {
+    let (z1, z2) = (Columns::load(&pairs.z1), Pixels::load(&pairs.z2));
+    // z1 is that of all rows.
+    let by_z2 = g.times(z2);
+    let (one, two) = (g.column_sums(), by_z2.column_sums());
+    let one_by_z1 = one.times(z1);
+    one.add_to(&mut sums[0]);
+    one_by_z1.add_to(&mut sums[1]);
+    two.add_to(&mut sums[2]);
+    one_by_z1.times_add_to(z1, &mut sums[3]);
+    two.times_add_to(z1, &mut sums[4]);
+    by_z2.times_add_to(z2, &mut sums[5]);
 }
 
 #[cfg(test)]

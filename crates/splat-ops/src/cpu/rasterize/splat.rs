@@ -1,9 +1,12 @@
 //! A splat as the pixels of a tile see it, and what becomes of a (pixel, splat) pair.
 
+use macerator::Simd;
+
 use super::super::buffer::Overwritten;
 use super::super::intersect::TILE;
 use super::super::real::Real;
 use super::gradient::MOMENTS;
+use super::pixels::{Columns, Pixels};
 use crate::settings::RasterizeArgs;
 
 /// Side of a block, the pixels that are worked on at once: as long as it is wide, since then fewest pixels are tested that
@@ -22,15 +25,9 @@ pub(super) const BLOCKS: usize = ACROSS * ACROSS;
 /// One value per pixel of a block.
 pub(super) type Lanes<T> = [T; LANES];
 
-/// Half of a block's pixels, its upper or its lower rows: both lie in the same columns, and need some things only once.
-pub(super) const HALF: usize = LANES / 2;
-
-/// One value per pixel of half a block.
-pub(super) type Half<T> = [T; HALF];
-
 /// As wide registers want it in memory: what lies across two lines of the cache is read and written twice as slowly.
 #[derive(Debug, Clone, Copy)]
-#[repr(align(32))]
+#[repr(align(64))]
 pub(super) struct Aligned<V>(pub(super) V);
 
 /// So many splats before its turn a splat is fetched: it lies anywhere in memory.
@@ -40,12 +37,16 @@ pub(super) const AHEAD: usize = 12;
 /// `sqrt(log2(e) / 2)`.
 const UNIT: f64 = 0.849_321_800_288_019_1;
 
-/// How many numbers a splat has.
+/// How many numbers a splat has beside its colour.
 pub(in crate::cpu) const NUMBERS: usize = 11;
 
-/// What the inner loops need of a splat. Its ellipse is the part of it that can pass the `alpha_min` test: `sigma <= cut`,
+/// So many channels are worked on at once.
+pub(in crate::cpu) const GROUP: usize = 4;
+
+/// What the inner loops need of a splat, in one line of the cache if in single precision. Its ellipse is the part of it that can pass the `alpha_min` test: `sigma <= cut`,
 /// cut being `ln(opacity / alpha_min)`, widened by a little so that rounding never drops a pixel.
 #[derive(Debug, Clone, Copy, Default)]
+#[repr(align(64))]
 pub(in crate::cpu) struct Splat<T> {
     pub(in crate::cpu) mean: [T; 2],
     /// [`UNIT`] times the inverse Cholesky factor.
@@ -60,6 +61,8 @@ pub(in crate::cpu) struct Splat<T> {
     inverse_a: T,
     /// The dy of the ellipse's right end; its left one lies opposite.
     end: T,
+    /// The first channels of its colour; zero where there are fewer.
+    pub(in crate::cpu) color: [T; GROUP],
 }
 
 impl<T: Overwritten> Overwritten for Splat<T> {
@@ -70,7 +73,7 @@ impl<T: Overwritten> Overwritten for Splat<T> {
 
 impl<T: Copy> Splat<T> {
     const fn of_one(number: T) -> Self {
-        Self::from_numbers([number; NUMBERS])
+        Self::from_numbers([number; NUMBERS], [number; GROUP])
     }
 
     #[inline(always)]
@@ -88,6 +91,7 @@ impl<T: Copy> Splat<T> {
             inverse_a,
             end,
         ]: [T; NUMBERS],
+        color: [T; GROUP],
     ) -> Self {
         Self {
             mean: [x, y],
@@ -100,9 +104,11 @@ impl<T: Copy> Splat<T> {
             shrink,
             inverse_a,
             end,
+            color,
         }
     }
 
+    /// All but its colour.
     #[inline(always)]
     pub(in crate::cpu) fn into_numbers(self) -> [T; NUMBERS] {
         let Self {
@@ -116,6 +122,7 @@ impl<T: Copy> Splat<T> {
             shrink,
             inverse_a,
             end,
+            ..
         } = self;
         [
             x, y, w11, w21, w22, opacity, slope, reach, shrink, inverse_a, end,
@@ -124,7 +131,7 @@ impl<T: Copy> Splat<T> {
 }
 
 impl<T: Real> Splat<T> {
-    /// From screen mean, inverse Cholesky factor and opacity; and half the height of its ellipse.
+    /// From screen mean, inverse Cholesky factor and opacity, without a colour; and half the height of its ellipse.
     #[inline(always)]
     pub(in crate::cpu) fn new([x, y, w11, w21, w22, opacity]: [T; 6], alpha_min: T) -> (Self, T) {
         let cut = (opacity / alpha_min).ln();
@@ -144,6 +151,7 @@ impl<T: Real> Splat<T> {
             inverse_a: T::ONE / a,
             // Where z2 = 0.
             end: -w21 / w22 * (radius / w11),
+            color: [T::ZERO; GROUP],
         };
         (splat, radius * a.sqrt() / (w11 * w22))
     }
@@ -186,23 +194,20 @@ impl<T: Real> Splat<T> {
         blocks as u16
     }
 
-    /// z1 in a column of pixels, and z2 at two pixels of it, in units of [`UNIT`].
+    /// z1 and z2 at the pixels of a block, in units of [`UNIT`].
     #[inline(always)]
-    pub(super) fn z<const FMA: bool>(&self, x: T, [upper, lower]: [T; 2]) -> (T, [T; 2]) {
-        let dx = x - self.mean[0];
-        let z2_of_dx = self.w21 * dx;
-        let z2 = |y: T| T::multiply_add::<FMA>(self.w22, y - self.mean[1], z2_of_dx);
-        (self.w11 * dx, [z2(upper), z2(lower)])
+    pub(super) fn z<S: Simd>(&self, centres: &Centres<S, T>) -> (Columns<S, T>, Pixels<S, T>) {
+        let [x, y] = self.mean;
+        let dx = centres.x.plus(-x);
+        let dy = centres.y.plus(Pixels::splat(-y));
+        let z2 = Pixels::splat(self.w22).times_plus(dy, dx.scaled(self.w21).pixels());
+        (dx.scaled(self.w11), z2)
     }
 
     /// Raw alphas at the pixels of a block, given the falloffs `2^-|z|^2`.
     #[inline(always)]
-    pub(super) fn raw(&self, falloffs: &Lanes<T>) -> Lanes<T> {
-        let mut raw = *falloffs;
-        for i in 0..LANES {
-            raw[i] = self.opacity * falloffs[i];
-        }
-        raw
+    pub(super) fn raw<S: Simd>(&self, falloffs: Pixels<S, T>) -> Pixels<S, T> {
+        Pixels::splat(self.opacity).times(falloffs)
     }
 
     /// Gradients of screen mean, w11, w21, w22, and of the opacity, from a splat's sums of g times 1, z1, z2, z1^2, z1 z2
@@ -224,38 +229,23 @@ impl<T: Real> Splat<T> {
 }
 
 /// Centres of the pixels of a block.
-#[derive(Clone, Copy)]
-pub(super) struct Centres<T> {
-    /// Of the upper and of the lower half.
-    pub(super) x: Half<T>,
-    pub(super) y: [Half<T>; 2],
+pub(super) struct Centres<S: Simd, T: Real> {
+    x: Columns<S, T>,
+    y: Pixels<S, T>,
 }
 
-impl<T: Real> Centres<T> {
-    /// Of each block of a tile, seen from its corner. To be kept in memory: if the compiler knew which of them are the
-    /// same, it would work on quarters and shuffle the results into place.
-    pub(super) fn of_blocks() -> [Self; BLOCKS] {
-        core::array::from_fn(|block| {
-            let along = |pixel: usize| T::of(pixel as f64 + 0.5);
-            let (column, row) = (block % ACROSS * SIDE, block / ACROSS * SIDE);
-            let rows = |first| core::array::from_fn(|i| along(row + (first + i) / SIDE));
-            Self {
-                x: core::array::from_fn(|i| along(column + i % SIDE)),
-                y: [rows(0), rows(HALF)],
-            }
-        })
-    }
-
-    /// From the corner of the image.
+impl<S: Simd, T: Real> Centres<S, T> {
+    /// Of a block of the tile with this corner.
     #[inline(always)]
-    pub(super) fn beyond(self, [left, top]: [T; 2]) -> Self {
-        let Self { mut x, mut y } = self;
-        for i in 0..HALF {
-            x[i] += left;
-            y[0][i] += top;
-            y[1][i] += top;
+    pub(super) fn new(block: usize, [left, top]: [T; 2]) -> Self {
+        let from = |corner: T, block: usize| corner + T::of_index((block * SIDE) as i32);
+        let within = |pixel: usize| T::of(pixel as f64 + 0.5);
+        let x = Columns::load(&core::array::from_fn(|i| within(i % SIDE)));
+        let y = Pixels::load(&core::array::from_fn(|i| within(i / SIDE)));
+        Self {
+            x: x.plus(from(left, block % ACROSS)),
+            y: y.plus(Pixels::splat(from(top, block / ACROSS))),
         }
-        Self { x, y }
     }
 }
 
@@ -274,27 +264,24 @@ pub(super) fn in_blocks(column: usize, row: usize) -> [usize; 2] {
     ]
 }
 
-/// `|z|^2` of two pixels of a column. Both passes call it, so both see the same bits.
+/// The lanes of a row of a block, and no more: a copy of all would be read before it is written.
 #[inline(always)]
-pub(super) fn squares<T: Real, const FMA: bool>(z1: T, [upper, lower]: [T; 2]) -> [T; 2] {
-    let of_z1 = z1 * z1;
-    [
-        T::multiply_add::<FMA>(upper, upper, of_z1),
-        T::multiply_add::<FMA>(lower, lower, of_z1),
-    ]
+pub(super) fn row_of<V: Copy>(lanes: &Lanes<V>, row: usize) -> [V; SIDE] {
+    let (rows, _) = lanes.as_chunks();
+    rows[row]
 }
 
-/// Whether any lane is less than a bound.
+/// The same, to be written.
 #[inline(always)]
-pub(super) fn any_less<T: Real>(lanes: &Lanes<T>, bound: T) -> bool {
-    // The lesser ones of both halves, which leaves one register to look at.
-    let mut least = [T::ZERO; HALF];
-    for i in 0..HALF {
-        least[i] = lanes[i].least(lanes[i + HALF]);
-    }
-    least
-        .iter()
-        .fold(false, |any, least| any | (*least < bound))
+pub(super) fn row_mut<V>(lanes: &mut Lanes<V>, row: usize) -> &mut [V; SIDE] {
+    let (rows, _) = lanes.as_chunks_mut();
+    &mut rows[row]
+}
+
+/// `|z|^2`. Both passes call it, so both see the same bits.
+#[inline(always)]
+pub(super) fn square<S: Simd, T: Real>(z1: Columns<S, T>, z2: Pixels<S, T>) -> Pixels<S, T> {
+    z2.times_plus(z2, z1.times(z1).pixels())
 }
 
 /// The one place that decides what becomes of a (pixel, splat) pair; both passes call it.
@@ -302,7 +289,7 @@ pub(super) fn any_less<T: Real>(lanes: &Lanes<T>, bound: T) -> bool {
 pub(super) struct Thresholds<T> {
     pub(super) alpha_min: T,
     alpha_max: T,
-    transmittance_min: T,
+    pub(super) transmittance_min: T,
 }
 
 impl<T: Real> Thresholds<T> {
@@ -314,30 +301,25 @@ impl<T: Real> Thresholds<T> {
         }
     }
 
+    /// Alpha where a splat is seen, zero elsewhere: where its raw alpha is below a gate.
     #[inline(always)]
-    pub(super) fn seen(&self, raw: T) -> bool {
-        raw >= self.alpha_min
+    pub(super) fn share<S: Simd>(&self, raw: Pixels<S, T>, gate: Pixels<S, T>) -> Pixels<S, T> {
+        let alpha = raw.least(Pixels::splat(self.alpha_max));
+        alpha.where_at_least(raw, gate)
     }
 
+    /// A gradient by the raw alpha where it is passed on: at the cap alpha no longer depends on anything.
     #[inline(always)]
-    pub(super) fn alpha(&self, raw: T) -> T {
-        raw.least(self.alpha_max)
-    }
-
-    /// At the cap alpha no longer depends on anything.
-    #[inline(always)]
-    pub(super) fn capped(&self, raw: T) -> bool {
-        raw >= self.alpha_max
+    pub(super) fn below_cap<S: Simd>(
+        &self,
+        gradient: Pixels<S, T>,
+        raw: Pixels<S, T>,
+    ) -> Pixels<S, T> {
+        gradient.where_below(raw, Pixels::splat(self.alpha_max))
     }
 
     #[inline(always)]
     pub(super) fn stops(&self, transmittance_after: T) -> bool {
         transmittance_after < self.transmittance_min
-    }
-
-    /// Whether any pixel of a block does.
-    #[inline(always)]
-    pub(super) fn any_stops(&self, transmittance_after: &Lanes<T>) -> bool {
-        any_less(transmittance_after, self.transmittance_min)
     }
 }

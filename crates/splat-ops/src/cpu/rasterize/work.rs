@@ -1,9 +1,12 @@
 //! How much work an image takes on the CPU.
 
 use burn::tensor::Tensor;
+use macerator::Simd;
 use rayon::prelude::*;
 
 use super::blend::BlendTile;
+use super::splat::LANES;
+use super::trace::Trace;
 use super::{Camera, Listed, View};
 use crate::backend::PROJECTED_WIDTH;
 use crate::rasterize::per_camera;
@@ -68,12 +71,10 @@ fn of_camera(camera: &Camera<f32>, args: &RasterizeArgs) -> Result<RasterizeWork
     let view = View::new(&listed, None, args);
     let tiles = (0..view.grid.columns * view.grid.rows).into_par_iter();
     let blended = tiles.map(|tile| {
-        let d = camera.channels;
         let mut work = RasterizeWork::default();
         let list = view.lists.tile(tile);
         let tile = [tile % view.grid.columns, tile / view.grid.columns];
-        // Without FMA a few pairs at a threshold may fall to its other side; for a count that is nothing.
-        BlendTile::new(d).blend::<false>(&view, list, tile, &mut Vec::new(), &mut work);
+        count_tile(&view, list, tile, &mut work);
         work
     });
     let mut work = blended.reduce(RasterizeWork::default, |mut sum, tile| {
@@ -82,6 +83,22 @@ fn of_camera(camera: &Camera<f32>, args: &RasterizeArgs) -> Result<RasterizeWork
     });
     work.instances = view.lists.instances() as u64;
     Ok(work)
+}
+
+#[macerator::with_simd]
+fn count_tile<'a, S: Simd>(
+    view: &View<'a, f32>,
+    list: &[u32],
+    tile: [usize; 2],
+    work: &mut RasterizeWork,
+) {
+    BlendTile::new(view.channels).blend::<S>(
+        view,
+        list,
+        tile,
+        &mut Trace::with_capacity(1, list.len()),
+        work,
+    );
 }
 
 impl RasterizeWork {
@@ -93,32 +110,36 @@ impl RasterizeWork {
     }
 }
 
-/// Told about every (pixel, splat) pair.
+/// Told about the pixels of every (block, splat) pair.
 pub(super) trait Tally {
-    /// Its alpha was evaluated.
-    fn tested(&mut self, seen: bool);
-    /// It may have been blended.
-    fn blended(&mut self, blended: bool);
+    /// Alphas were evaluated; asks which of them are seen.
+    fn tested(&mut self, seen: impl FnOnce() -> [bool; LANES]);
+    /// Alphas may have been blended; asks which of them were.
+    fn blended(&mut self, blended: impl FnOnce() -> [bool; LANES]);
 }
 
 /// Nobody counts, and it costs nothing.
 impl Tally for () {
     #[inline(always)]
-    fn tested(&mut self, _: bool) {}
+    fn tested(&mut self, _: impl FnOnce() -> [bool; LANES]) {}
 
     #[inline(always)]
-    fn blended(&mut self, _: bool) {}
+    fn blended(&mut self, _: impl FnOnce() -> [bool; LANES]) {}
 }
 
 impl Tally for RasterizeWork {
-    fn tested(&mut self, seen: bool) {
-        self.tested += 1;
-        self.seen += u64::from(seen);
+    fn tested(&mut self, seen: impl FnOnce() -> [bool; LANES]) {
+        self.tested += LANES as u64;
+        self.seen += count(seen());
     }
 
-    fn blended(&mut self, blended: bool) {
-        self.blended += u64::from(blended);
+    fn blended(&mut self, blended: impl FnOnce() -> [bool; LANES]) {
+        self.blended += count(blended());
     }
+}
+
+fn count(pixels: [bool; LANES]) -> u64 {
+    pixels.iter().map(|pixel| u64::from(*pixel)).sum()
 }
 
 #[cfg(test)]

@@ -1,0 +1,294 @@
+//! The pixels of a block in registers.
+//!
+//! Written with SIMD types, where elsewhere loops over lanes become SIMD code: these passes are most of a training step, and
+//! the compiler's guesses at such loops change with what stands around them.
+
+use macerator::{Mask, Simd, Vector};
+
+use super::super::real::Real;
+use super::splat::{Aligned, LANES, Lanes, SIDE};
+
+/// What is computed of every register, of those that are used.
+// No closure: the compiler must put every function between the instructions and the one that is compiled for them into the
+// latter, and knows no way to be told so of closures.
+macro_rules! each_register {
+    ($type:ident, $i:ident => $value:expr) => {{
+        let mut result = $type([T::ZERO.splat(); _]);
+        for $i in 0..$type::<S, T>::registers() {
+            result.0[$i] = $value;
+        }
+        result
+    }};
+}
+
+/// One value per pixel of a block, in as many registers as it takes.
+// An array as long as registers of one lane would make it, as their length has to be known; the compiler drops what is not used.
+pub(super) struct Pixels<S: Simd, T: Real>([Vector<S, T>; LANES]);
+
+impl<S: Simd, T: Real> Clone for Pixels<S, T> {
+    #[inline(always)]
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<S: Simd, T: Real> Copy for Pixels<S, T> {}
+
+impl<S: Simd, T: Real> Pixels<S, T> {
+    #[inline(always)]
+    fn registers() -> usize {
+        LANES / T::lanes::<S>()
+    }
+
+    #[inline(always)]
+    pub(super) fn splat(value: T) -> Self {
+        Self([value.splat(); LANES])
+    }
+
+    #[inline(always)]
+    pub(super) fn load(lanes: &Lanes<T>) -> Self {
+        each_register!(Pixels, i => register(lanes, i))
+    }
+
+    #[inline(always)]
+    pub(super) fn store(self, lanes: &mut Lanes<T>) {
+        for i in 0..Self::registers() {
+            store_register(self.0[i], lanes, i);
+        }
+    }
+
+    #[inline(always)]
+    pub(super) fn lanes(self) -> Lanes<T> {
+        let mut lanes = [T::ZERO; LANES];
+        self.store(&mut lanes);
+        lanes
+    }
+
+    #[inline(always)]
+    pub(super) fn plus(self, other: Self) -> Self {
+        each_register!(Pixels, i => self.0[i] + other.0[i])
+    }
+
+    #[inline(always)]
+    pub(super) fn minus(self, other: Self) -> Self {
+        each_register!(Pixels, i => self.0[i] - other.0[i])
+    }
+
+    #[inline(always)]
+    pub(super) fn times(self, other: Self) -> Self {
+        each_register!(Pixels, i => self.0[i] * other.0[i])
+    }
+
+    /// The lesser one; the other if one is NaN, or NaN, as the processor has it.
+    #[inline(always)]
+    pub(super) fn least(self, other: Self) -> Self {
+        each_register!(Pixels, i => self.0[i].min(other.0[i]))
+    }
+
+    /// `self b + c`, in one rounding where that is one instruction.
+    #[inline(always)]
+    pub(super) fn times_plus(self, b: Self, c: Self) -> Self {
+        each_register!(Pixels, i => self.0[i].mul_add(b.0[i], c.0[i]))
+    }
+
+    /// `c - self b`, likewise.
+    #[inline(always)]
+    pub(super) fn times_from(self, b: Self, c: Self) -> Self {
+        // Subtracted from -0, which is how a compiler knows a change of sign; it becomes part of the instruction.
+        let sign = T::of(-0.0).splat();
+        each_register!(Pixels, i => (sign - self.0[i]).mul_add(b.0[i], c.0[i]))
+    }
+
+    /// `2^-self`, see [`Real::exp2_neg`].
+    #[inline(always)]
+    pub(super) fn exp2_neg(self) -> Self {
+        let mut powers = self;
+        T::exp2_neg(&mut powers.0[..Self::registers()]);
+        powers
+    }
+
+    /// What is here where `values >= bound`, and zero elsewhere.
+    #[inline(always)]
+    pub(super) fn where_at_least(self, values: Self, bound: Self) -> Self {
+        each_register!(Pixels, i => kept(values.0[i].ge(bound.0[i]), self.0[i]))
+    }
+
+    /// What is here where `values < bound`, and zero elsewhere.
+    #[inline(always)]
+    pub(super) fn where_below(self, values: Self, bound: Self) -> Self {
+        each_register!(Pixels, i => kept(values.0[i].lt(bound.0[i]), self.0[i]))
+    }
+
+    /// Whether any pixel is below.
+    #[inline(always)]
+    pub(super) fn any_below(self, bound: T) -> bool {
+        let mut least = self.0[0];
+        for i in 1..Self::registers() {
+            least = least.min(self.0[i]);
+        }
+        least.lt(bound.splat()).any()
+    }
+
+    /// Sums over the rows.
+    #[inline(always)]
+    pub(super) fn column_sums(self) -> Columns<S, T> {
+        let mut sums = Columns([T::ZERO.splat(); SIDE]);
+        let count = Columns::<S, T>::registers();
+        for i in 0..count {
+            sums.0[i] = self.0[i];
+            for row in (i + count..Self::registers()).step_by(count) {
+                sums.0[i] += self.0[row];
+            }
+        }
+        sums
+    }
+
+    /// `sum + self b`, summed over the registers.
+    #[inline(always)]
+    pub(super) fn times_add_to(self, b: Self, sum: &mut Vector<S, T>) {
+        for i in 0..Self::registers() {
+            *sum = self.0[i].mul_add(b.0[i], *sum);
+        }
+    }
+}
+
+/// One value per column of a block: of one register, or more where they are narrower than a row.
+pub(super) struct Columns<S: Simd, T: Real>([Vector<S, T>; SIDE]);
+
+impl<S: Simd, T: Real> Clone for Columns<S, T> {
+    #[inline(always)]
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<S: Simd, T: Real> Copy for Columns<S, T> {}
+
+impl<S: Simd, T: Real> Columns<S, T> {
+    #[inline(always)]
+    fn registers() -> usize {
+        SIDE.div_ceil(T::lanes::<S>())
+    }
+
+    /// From pixels whose rows are alike.
+    #[inline(always)]
+    pub(super) fn load(lanes: &Lanes<T>) -> Self {
+        each_register!(Columns, i => register(lanes, i))
+    }
+
+    /// As [`load`](Self::load) takes it.
+    #[inline(always)]
+    pub(super) fn store(self, lanes: &mut Lanes<T>) {
+        for i in 0..Self::registers() {
+            store_register(self.0[i], lanes, i);
+        }
+    }
+
+    /// The same in every row.
+    #[inline(always)]
+    pub(super) fn pixels(self) -> Pixels<S, T> {
+        each_register!(Pixels, i => self.0[i % Self::registers()])
+    }
+
+    #[inline(always)]
+    pub(super) fn plus(self, value: T) -> Self {
+        each_register!(Columns, i => self.0[i] + value.splat())
+    }
+
+    #[inline(always)]
+    pub(super) fn scaled(self, value: T) -> Self {
+        each_register!(Columns, i => self.0[i] * value.splat())
+    }
+
+    #[inline(always)]
+    pub(super) fn times(self, other: Self) -> Self {
+        each_register!(Columns, i => self.0[i] * other.0[i])
+    }
+
+    /// `sum + self`, summed over the registers.
+    #[inline(always)]
+    pub(super) fn add_to(self, sum: &mut Vector<S, T>) {
+        for i in 0..Self::registers() {
+            *sum += self.0[i];
+        }
+    }
+
+    /// `sum + self b`, summed over the registers.
+    #[inline(always)]
+    pub(super) fn times_add_to(self, b: Self, sum: &mut Vector<S, T>) {
+        for i in 0..Self::registers() {
+            *sum = self.0[i].mul_add(b.0[i], *sum);
+        }
+    }
+}
+
+/// What is in a register where a mask is set, and zero elsewhere.
+#[inline(always)]
+fn kept<S: Simd, T: Real>(mask: Mask<S, T>, register: Vector<S, T>) -> Vector<S, T> {
+    let bits = bytemuck::bytes_of(&*mask);
+    if bits.len() != size_of::<Vector<S, T>>() {
+        return mask.select(register, T::ZERO.splat());
+    }
+    // A mask of a register's size has all bits of a lane set or none, which makes this one operation instead of two.
+    let bits: Vector<S, u32> = bytemuck::pod_read_unaligned(bits);
+    (bits & register.reinterpret()).reinterpret()
+}
+
+/// The sum of a register's lanes: halves are added to halves.
+#[inline(always)]
+pub(super) fn total<S: Simd, T: Real>(register: Vector<S, T>) -> T {
+    let [a, b, c, d] = quarters(register);
+    (a + c) + (b + d)
+}
+
+/// Four of them.
+#[inline(always)]
+pub(super) fn four_totals<S: Simd, T: Real>(registers: [Vector<S, T>; 4]) -> [T; 4] {
+    let [a, b, c, d] = registers;
+    let [a, b, c, d] = T::transposed([quarters(a), quarters(b), quarters(c), quarters(d)]);
+    let mut totals = [T::ZERO; 4];
+    for i in 0..4 {
+        totals[i] = (a[i] + c[i]) + (b[i] + d[i]);
+    }
+    totals
+}
+
+/// A register's lanes added up to four, zeros where there are fewer.
+#[inline(always)]
+fn quarters<S: Simd, T: Real>(register: Vector<S, T>) -> [T; 4] {
+    let mut sums = [T::ZERO; LANES];
+    let mut width = T::lanes::<S>();
+    sums[..width].copy_from_slice(bytemuck::cast_slice(core::slice::from_ref(&register)));
+    while width > 4 {
+        width /= 2;
+        for i in 0..width {
+            sums[i] += sums[i + width];
+        }
+    }
+    [sums[0], sums[1], sums[2], sums[3]]
+}
+
+/// Several.
+#[inline(always)]
+pub(super) fn load_each<S: Simd, T: Real, const COUNT: usize>(
+    lanes: &[Aligned<Lanes<T>>],
+) -> [Pixels<S, T>; COUNT] {
+    let mut pixels = [Pixels::splat(T::ZERO); COUNT];
+    for i in 0..COUNT {
+        pixels[i] = Pixels::load(&lanes[i].0);
+    }
+    pixels
+}
+
+#[inline(always)]
+fn register<S: Simd, T: Real>(lanes: &Lanes<T>, i: usize) -> Vector<S, T> {
+    let width = T::lanes::<S>();
+    bytemuck::pod_read_unaligned(bytemuck::cast_slice(&lanes[i * width..(i + 1) * width]))
+}
+
+#[inline(always)]
+fn store_register<S: Simd, T: Real>(register: Vector<S, T>, lanes: &mut Lanes<T>, i: usize) {
+    let width = T::lanes::<S>();
+    let values: &[T] = bytemuck::cast_slice(core::slice::from_ref(&register));
+    lanes[i * width..(i + 1) * width].copy_from_slice(values);
+}
