@@ -54,7 +54,7 @@ impl Rendered {
 /// mean, inverse Cholesky factor, colour and opacity; depth and extent only order and cull.
 ///
 /// # Errors
-/// When shapes, types or devices do not fit, when the splats touch more tiles than one call can list
+/// When shapes, types or devices do not fit, when a setting is out of range, when the splats touch more tiles than one call can list
 /// ([`OpError::TooManyPairs`]), and when the device fails.
 pub fn rasterize<const DC: usize, const DO: usize>(
     projected: &Projected,
@@ -63,6 +63,7 @@ pub fn rasterize<const DC: usize, const DO: usize>(
     background: Option<Tensor<2>>,
     settings: &RasterizeSettings,
 ) -> Result<Rendered, OpError> {
+    check_settings(settings)?;
     let packed = projected.packed();
     let (colors, opacities) = per_camera(projected, colors, opacities)?;
     let [c, _, channels] = colors.dims();
@@ -98,6 +99,28 @@ pub fn rasterize<const DC: usize, const DO: usize>(
         packed: Tensor::from_dispatch(packed),
         image: OnceLock::new(),
         alpha: OnceLock::new(),
+    })
+}
+
+/// Behind an alpha of one there would be no light to divide by, and a splat without a least alpha has no end.
+pub(crate) fn check_settings(settings: &RasterizeSettings) -> Result<(), OpError> {
+    let RasterizeSettings {
+        alpha_min,
+        alpha_max,
+        transmittance_min,
+        ..
+    } = *settings;
+    // In single precision, in which most devices compute.
+    let (least, most) = (alpha_min as f32, alpha_max as f32);
+    if 0.0 < least && least <= most && most < 1.0 && (0.0..1.0).contains(&transmittance_min) {
+        return Ok(());
+    }
+    Err(OpError::Argument {
+        op: "rasterize",
+        what: format!(
+            "settings: `alpha_min` is {alpha_min}, `alpha_max` {alpha_max} and `transmittance_min` {transmittance_min}; they must \
+             be 0 < alpha_min <= alpha_max < 1 and 0 <= transmittance_min < 1"
+        ),
     })
 }
 
@@ -152,4 +175,40 @@ pub(crate) fn per_camera<const DC: usize, const DO: usize>(
     check.tensor("colors", &colors, [None; 3], "[C, N, D]")?;
     check.tensor("opacities", &opacities, [None; 2], "[C, N]")?;
     Ok((colors, opacities))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_out_of_range_are_named() {
+        let usual = RasterizeSettings::default();
+        assert_eq!(check_settings(&usual), Ok(()));
+        let wrong = [
+            ("alpha_min", 0.0, 0.99, 1e-4),
+            ("alpha_min", f64::NAN, 0.99, 1e-4),
+            ("alpha_min", 0.5, 0.4, 1e-4),
+            ("alpha_max", 0.01, 1.0, 1e-4),
+            ("alpha_max", 0.01, 0.999_999_999, 1e-4),
+            ("transmittance_min", 0.01, 0.99, -1e-4),
+            ("transmittance_min", 0.01, 0.99, 1.0),
+            ("transmittance_min", 0.01, 0.99, f64::NAN),
+        ];
+        for (name, alpha_min, alpha_max, transmittance_min) in wrong {
+            let settings = RasterizeSettings {
+                alpha_min,
+                alpha_max,
+                transmittance_min,
+                ..usual
+            };
+            let message = check_settings(&settings).unwrap_err().to_string();
+            assert!(message.contains(name), "{message}");
+        }
+        let never = RasterizeSettings {
+            transmittance_min: 0.0,
+            ..usual
+        };
+        assert_eq!(check_settings(&never), Ok(()));
+    }
 }

@@ -46,11 +46,11 @@ impl Default for ProjectSettings {
 /// Settings of [`rasterize`](crate::rasterize).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RasterizeSettings {
-    /// A splat is skipped at a pixel where its alpha is below this. Default 1/255 (3DGS appendix C).
+    /// A splat is skipped at a pixel where its alpha is below this, which is above 0. Default 1/255 (3DGS appendix C).
     pub alpha_min: f64,
-    /// Alpha is capped here; the gradient through a capped alpha is zero. Default 0.99 (3DGS appendix C).
+    /// Alpha is capped here, below 1; the gradient through a capped alpha is zero. Default 0.99 (3DGS appendix C).
     pub alpha_max: f64,
-    /// A pixel stops before its transmittance would fall below this. Default 9.999e-5: the 1e-4 of
+    /// A pixel stops before its transmittance would fall below this; never, if it is 0. Default 9.999e-5: the 1e-4 of
     /// 3DGS appendix C less one part in 10,000, because two splats at the cap leave exactly 1e-4,
     /// which rounds to either side.
     pub transmittance_min: f64,

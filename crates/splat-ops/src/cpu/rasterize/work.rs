@@ -9,7 +9,7 @@ use super::splat::LANES;
 use super::trace::Trace;
 use super::{Camera, Listed, View};
 use crate::backend::PROJECTED_WIDTH;
-use crate::rasterize::per_camera;
+use crate::rasterize::{check_settings, per_camera};
 use crate::settings::RasterizeArgs;
 use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
 
@@ -36,6 +36,7 @@ pub fn rasterize_work<const DC: usize, const DO: usize>(
     opacities: Tensor<DO>,
     settings: &RasterizeSettings,
 ) -> Result<RasterizeWork, OpError> {
+    check_settings(settings)?;
     let (colors, opacities) = per_camera(projected, colors, opacities)?;
     let [c, n, d] = colors.dims();
     let host = |tensor: Tensor<3>| {
