@@ -172,6 +172,14 @@ impl<'a, T: Real> View<'a, T> {
         }
     }
 
+    /// The splats of a tile, front to back; none beyond the end of its row.
+    fn list(&self, [tx, ty]: [usize; 2]) -> &[u32] {
+        match tx < self.grid.columns {
+            true => self.lists.tile(ty * self.grid.columns + tx),
+            false => &[],
+        }
+    }
+
     /// Columns and rows of a tile that lie in the image.
     fn inside(&self, [tx, ty]: [usize; 2]) -> [usize; 2] {
         [
@@ -289,8 +297,7 @@ fn blend_row_of_tiles<'a, S: Simd, T: Real>(
     let splats = view.lists.row_of_tiles(ty, view.grid).len();
     let mut trace = Trace::with_capacity(view.grid.columns, splats);
     for tx in 0..view.grid.columns {
-        let list = view.lists.tile(ty * view.grid.columns + tx);
-        tile.blend::<S>(view, list, [tx, ty], &mut trace, &mut ());
+        tile.blend::<S>(view, [tx, ty], &mut trace, &mut ());
         tile.store::<S>(view, [tx, ty], image);
     }
     trace
@@ -379,13 +386,12 @@ fn row_of_tiles_backward<'a, S: Simd, T: Real>(
     let mut tile = GradientTile::<S, T>::new(channels);
     let (mut partials, mut first) = (partials, 0);
     for tx in 0..view.grid.columns {
-        let list = view.lists.tile(ty * view.grid.columns + tx);
-        let length = list.len() * (MOMENTS + channels);
-        let (sums, later) = core::mem::take(&mut partials).split_at_mut(length);
-        let of_tile = trace.tile(tx, first..first + list.len());
-        (partials, first) = (later, first + list.len());
+        let count = view.list([tx, ty]).len();
+        let (sums, later) = partials.split_at_mut(count * (MOMENTS + channels));
+        let of_tile = trace.tile(tx, first..first + count);
+        (partials, first) = (later, first + count);
         tile.load(view, grad, [tx, ty], &of_tile, &mut background);
-        tile.walk(view, list, [tx, ty], &of_tile, sums);
+        tile.walk(view, [tx, ty], &of_tile, sums);
     }
     background
 }

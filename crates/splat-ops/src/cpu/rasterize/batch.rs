@@ -5,7 +5,7 @@ use core::ops::Range;
 use super::super::real::Real;
 use super::super::simd::prefetch;
 use super::View;
-use super::splat::{AHEAD, BLOCKS, GROUP, Splat};
+use super::splat::{BLOCKS, GROUP, Splat};
 
 /// How many: so many that what is kept of each fits the first-level cache, and few enough for eight bits.
 pub(super) const BATCH: usize = 128;
@@ -51,14 +51,15 @@ impl<T: Real> Batch<T> {
         }
     }
 
-    /// Fetches the splats of a part of a list with their colours, and returns them.
+    /// Fetches the splats of a part of a list with their colours, and returns them; and begins to fetch those of the part
+    /// that comes next, which lie anywhere in memory.
     #[inline(always)]
-    pub(super) fn gather(&mut self, view: &View<T>, list: &[u32]) -> &[Splat<T>] {
-        for (place, (splat, index)) in self.splats.iter_mut().zip(list).enumerate() {
-            if let Some(next) = list.get(place + AHEAD) {
-                prefetch(view.splats, *next as usize..*next as usize + 1);
-            }
+    pub(super) fn gather(&mut self, view: &View<T>, list: &[u32], next: &[u32]) -> &[Splat<T>] {
+        for (splat, index) in self.splats.iter_mut().zip(list) {
             *splat = view.splats[*index as usize];
+        }
+        for index in next {
+            prefetch(view.splats, *index as usize..*index as usize + 1);
         }
         let channels = view.channels;
         by_groups!(self.gather_colors(GROUP..channels, view, list));

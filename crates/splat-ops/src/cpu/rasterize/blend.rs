@@ -52,21 +52,23 @@ impl<T: Real> BlendTile<T> {
     pub(super) fn blend<S: Simd>(
         &mut self,
         view: &View<T>,
-        list: &[u32],
-        tile: [usize; 2],
+        [tx, ty]: [usize; 2],
         trace: &mut Trace<T>,
         tally: &mut impl Tally,
     ) {
+        let [list, beside] = [tx, tx + 1].map(|tx| view.list([tx, ty]));
         let thresholds = Thresholds::<T>::new(view.args);
-        let (corner, channels) = (corner(tile), view.channels);
-        let mut open = self.begin(view.inside(tile), &thresholds);
+        let (corner, channels) = (corner([tx, ty]), view.channels);
+        let mut open = self.begin(view.inside([tx, ty]), &thresholds);
         let end = trace.reached.len() + list.len();
 
-        for (number, part) in list.chunks(BATCH).enumerate() {
+        let next = [beside.chunks(BATCH).next().unwrap_or_default()];
+        let next = list.chunks(BATCH).skip(1).chain(next);
+        for (number, (part, next)) in list.chunks(BATCH).zip(next).enumerate() {
             if number > 0 {
                 trace.transmittance.push(self.transmittance);
             }
-            let splats = self.batch.gather(view, part);
+            let splats = self.batch.gather(view, part, next);
             let first = trace.reached.len();
             trace.reached.resize(first + splats.len(), 0);
             let reached = &mut trace.reached[first..];
@@ -307,28 +309,33 @@ impl<T: Real> BlendTile<T> {
     /// Writes a row of the tile.
     #[inline(always)]
     fn store_row(&self, row: usize, image: &mut [T], channels: usize) {
-        let blocks = (self.colors.chunks_exact(channels)).zip(&self.transmittance);
-        let blocks = blocks.skip(row / SIDE * ACROSS);
-        for (pixels, (planes, left)) in image.chunks_mut(SIDE * (channels + 1)).zip(blocks) {
+        let first = row / SIDE * ACROSS;
+        let (whole, rest) = match channels {
+            3 => image.as_chunks_mut::<{ 4 * SIDE }>(),
+            _ => (&mut [][..], image),
+        };
+        let blocks = self.colors.as_chunks::<3>().0.iter();
+        let blocks = blocks.zip(&self.transmittance).skip(first);
+        for (pixels, (planes, left)) in whole.iter_mut().zip(blocks) {
+            let [red, green, blue] = planes.map(|plane| row_of(&plane.0, row % SIDE));
             let alpha = row_of(&left.0, row % SIDE).map(|left| T::ONE - left);
-            match (planes, pixels.as_mut_array::<{ 4 * SIDE }>()) {
-                // Pixels of four numbers, of which as many are written at once.
-                ([red, green, blue], Some(pixels)) => {
-                    let [red, green, blue] =
-                        [red, green, blue].map(|plane| row_of(&plane.0, row % SIDE));
-                    let rows = T::transposed([red, green, blue, alpha]);
-                    pixels.copy_from_slice(rows.as_flattened());
-                }
-                (planes, _) => {
-                    for (i, pixel) in pixels.chunks_exact_mut(channels + 1).enumerate() {
-                        let (color, of_alpha) = pixel.split_at_mut(channels);
-                        for (out, plane) in color.iter_mut().zip(planes) {
-                            *out = row_of(&plane.0, row % SIDE)[i];
-                        }
-                        of_alpha[0] = alpha[i];
-                    }
-                }
+            let rows = T::transposed([red, green, blue, alpha]);
+            pixels.copy_from_slice(rows.as_flattened());
+        }
+        self.store_pixels(row, first + whole.len(), rest, channels);
+    }
+
+    /// Writes pixels of a row of the tile, of any number of channels, from those of a block on.
+    // By itself: what its loops need to remember would take the registers of the other one.
+    #[inline(never)]
+    fn store_pixels(&self, row: usize, first: usize, image: &mut [T], channels: usize) {
+        for (i, pixel) in image.chunks_exact_mut(channels + 1).enumerate() {
+            let [block, lane] = [first + i / SIDE, row % SIDE * SIDE + i % SIDE];
+            let (color, alpha) = pixel.split_at_mut(channels);
+            for (out, plane) in color.iter_mut().zip(&self.colors[block * channels..]) {
+                *out = plane.0[lane];
             }
+            alpha[0] = T::ONE - self.transmittance[block].0[lane];
         }
     }
 }

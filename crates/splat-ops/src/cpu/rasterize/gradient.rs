@@ -31,7 +31,7 @@ use super::batch::{BATCH, Batch, ByPlace, by_groups};
 use super::pixels::{Columns, Pixels, four_totals, load_each, total};
 use super::splat::{
     ACROSS, Aligned, BLOCKS, Centres, GROUP, LANES, Lanes, SIDE, Thresholds, corner, row_mut,
-    square,
+    row_of, square,
 };
 use super::trace::{ByBlock, TileTrace};
 
@@ -125,28 +125,35 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
     /// Reads a row of the tile; gradients of alpha take the place of B.
     #[inline(always)]
     fn load_row(&mut self, row: usize, grad: &[T], channels: usize) {
-        let blocks = self.grad.chunks_exact_mut(channels).zip(&mut self.behind);
-        let blocks = blocks.skip(row / SIDE * ACROSS);
-        for (grad, (planes, behind)) in grad.chunks(SIDE * (channels + 1)).zip(blocks) {
-            let of_alpha = row_mut(&mut behind.0, row % SIDE);
-            match (planes, grad.as_chunks::<4>().0.as_array::<SIDE>()) {
-                // Pixels of four numbers, of which as many are read at once.
-                ([red, green, blue], Some(grad)) => {
-                    let [of_red, of_green, of_blue, alpha] = T::transposed(*grad);
-                    *row_mut(&mut red.0, row % SIDE) = of_red;
-                    *row_mut(&mut green.0, row % SIDE) = of_green;
-                    *row_mut(&mut blue.0, row % SIDE) = of_blue;
-                    *of_alpha = alpha;
-                }
-                (planes, _) => {
-                    for (i, grad) in grad.chunks_exact(channels + 1).enumerate() {
-                        for (plane, grad) in planes.iter_mut().zip(grad) {
-                            row_mut(&mut plane.0, row % SIDE)[i] = *grad;
-                        }
-                        of_alpha[i] = grad[channels];
-                    }
-                }
+        let first = row / SIDE * ACROSS;
+        let (whole, rest) = match channels {
+            3 => grad.as_chunks::<{ 4 * SIDE }>(),
+            _ => (&[][..], grad),
+        };
+        let blocks = self.grad.as_chunks_mut::<3>().0.iter_mut();
+        let blocks = blocks.zip(&mut self.behind).skip(first);
+        for (grad, (planes, behind)) in whole.iter().zip(blocks) {
+            let pixels = core::array::from_fn(|i| row_of(grad, i));
+            let [red, green, blue, alpha] = T::transposed(pixels);
+            for (plane, values) in planes.iter_mut().zip([red, green, blue]) {
+                *row_mut(&mut plane.0, row % SIDE) = values;
             }
+            *row_mut(&mut behind.0, row % SIDE) = alpha;
+        }
+        self.load_pixels(row, first + whole.len(), rest, channels);
+    }
+
+    /// Reads pixels of a row of the tile, of any number of channels, from those of a block on.
+    // By itself: what its loops need to remember would take the registers of the other one.
+    #[inline(never)]
+    fn load_pixels(&mut self, row: usize, first: usize, grad: &[T], channels: usize) {
+        for (i, grad) in grad.chunks_exact(channels + 1).enumerate() {
+            let [block, lane] = [first + i / SIDE, row % SIDE * SIDE + i % SIDE];
+            let planes = &mut self.grad[block * channels..];
+            for (plane, grad) in planes.iter_mut().zip(&grad[..channels]) {
+                plane.0[lane] = *grad;
+            }
+            self.behind[block].0[lane] = grad[channels];
         }
     }
 
@@ -178,20 +185,22 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
     pub(super) fn walk(
         &mut self,
         view: &View<T>,
-        list: &[u32],
-        tile: [usize; 2],
+        [tx, ty]: [usize; 2],
         trace: &TileTrace<T>,
         partials: &mut [T],
     ) {
+        let [list, beside] = [tx, tx + 1].map(|tx| view.list([tx, ty]));
         let channels = view.channels;
         let thresholds = Thresholds::<T>::new(view.args);
-        let corner = corner(tile);
+        let corner = corner([tx, ty]);
         let batches = list.chunks(BATCH).zip(trace.reached.chunks(BATCH));
         let batches = batches.zip(partials.chunks_mut(BATCH * (MOMENTS + channels)));
-        for (number, ((list, reached), partials)) in batches.enumerate().rev() {
-            self.batch.gather(view, list);
+        let next = [beside.chunks(BATCH).next_back().unwrap_or_default()].into_iter();
+        let next = next.chain(list.chunks(BATCH)).rev().skip(1);
+        for ((number, ((part, reached), partials)), next) in batches.enumerate().rev().zip(next) {
+            self.batch.gather(view, part, next);
             self.batch.places.fill(reached);
-            self.clear_sums(list.len(), channels);
+            self.clear_sums(part.len(), channels);
             let first = (number * BATCH) as i32;
             for block in 0..BLOCKS {
                 let stop = &trace.stop[block].0;

@@ -30,9 +30,6 @@ pub(super) type Lanes<T> = [T; LANES];
 #[repr(align(64))]
 pub(super) struct Aligned<V>(pub(super) V);
 
-/// So many splats before its turn a splat is fetched: it lies anywhere in memory.
-pub(super) const AHEAD: usize = 12;
-
 /// The inverse Cholesky factor times this, squared, counts in powers of two: `2^-|z|^2 = exp(-sigma)`.
 /// `sqrt(log2(e) / 2)`.
 const UNIT: f64 = 0.849_321_800_288_019_1;
@@ -43,8 +40,9 @@ pub(in crate::cpu) const NUMBERS: usize = 11;
 /// So many channels are worked on at once.
 pub(in crate::cpu) const GROUP: usize = 4;
 
-/// What the inner loops need of a splat, in one line of the cache if in single precision. Its ellipse is the part of it that can pass the `alpha_min` test: `sigma <= cut`,
-/// cut being `ln(opacity / alpha_min)`, widened by a little so that rounding never drops a pixel.
+/// What the inner loops need of a splat, in one line of the cache if in single precision. Its ellipse is the part of it that
+/// can pass the `alpha_min` test: `sigma <= cut`, cut being `ln(opacity / alpha_min)`, widened by a little so that rounding
+/// never drops a pixel.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(align(64))]
 pub(in crate::cpu) struct Splat<T> {

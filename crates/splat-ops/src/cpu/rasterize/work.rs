@@ -73,9 +73,8 @@ fn of_camera(camera: &Camera<f32>, args: &RasterizeArgs) -> Result<RasterizeWork
     let tiles = (0..view.grid.columns * view.grid.rows).into_par_iter();
     let blended = tiles.map(|tile| {
         let mut work = RasterizeWork::default();
-        let list = view.lists.tile(tile);
         let tile = [tile % view.grid.columns, tile / view.grid.columns];
-        count_tile(&view, list, tile, &mut work);
+        count_tile(&view, tile, &mut work);
         work
     });
     let mut work = blended.reduce(RasterizeWork::default, |mut sum, tile| {
@@ -87,17 +86,11 @@ fn of_camera(camera: &Camera<f32>, args: &RasterizeArgs) -> Result<RasterizeWork
 }
 
 #[macerator::with_simd]
-fn count_tile<'a, S: Simd>(
-    view: &View<'a, f32>,
-    list: &[u32],
-    tile: [usize; 2],
-    work: &mut RasterizeWork,
-) {
+fn count_tile<'a, S: Simd>(view: &View<'a, f32>, tile: [usize; 2], work: &mut RasterizeWork) {
     BlendTile::new(view.channels).blend::<S>(
         view,
-        list,
         tile,
-        &mut Trace::with_capacity(1, list.len()),
+        &mut Trace::with_capacity(1, view.list(tile).len()),
         work,
     );
 }
