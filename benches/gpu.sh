@@ -65,12 +65,12 @@ command -v cargo >/dev/null || fail "cargo is not there; see README.md"
 if $smoke; then
     downscale=16 seconds=0 steps=(10 20)
     grid=(--gaussians 200,2000 --pixels 3000,12000)
-    large=(--gaussians 1000,3000 --pixels 96x54)
+    synthetic=(1000 3000) photo=96x54
     tests=(--test work) accuracy=false
 else
     seconds=10 steps=(7000 30000)
     grid=()
-    large=(--gaussians 100000,1000000,5000000 --pixels 1920x1080)
+    synthetic=(100000 1000000 5000000) photo=1920x1080
     tests=() accuracy=true
 fi
 
@@ -166,7 +166,7 @@ done
 section scaling "$folder/scaling.json" \
     "${splat[@]}" bench scaling ${grid[@]+"${grid[@]}"} --json "$folder/scaling.json" --svg "$folder/scaling.svg"
 section "scaling at full size" "$folder/scaling_large.json" \
-    "${splat[@]}" bench scaling "${large[@]}" --json "$folder/scaling_large.json"
+    "${splat[@]}" bench scaling --gaussians "$(IFS=,; echo "${synthetic[*]}")" --pixels "$photo" --json "$folder/scaling_large.json"
 
 for capture in "${captures[@]}"; do
     name=$(basename "$capture")
@@ -183,15 +183,28 @@ if [[ -n $python ]]; then
     section "gsplat errors" "$folder/gsplat_errors.json" \
         "$python" benches/gsplat_errors.py tests/fixtures/*.safetensors \
         --ours "$folder/gradcheck.json" --json "$folder/gsplat_errors.json"
-    for capture in "${captures[@]}"; do
-        name=$(basename "$capture")
-        # After one step a scene is still the capture's first Gaussians, those of `bench step`.
+    # A capture's first Gaussians, which are what `bench step` measures: here and with gsplat.
+    beside_gsplat() {
+        local name=$1 capture=$2 downscale=$3
+        # After one step a scene is still the first one.
         section "first scene $name" - "${splat[@]}" train "$capture" --downscale "$downscale" --steps 1 --out "$folder/first_$name"
         section "rasterize first $name" "$folder/rasterize_first_$name.json" \
-            "${splat[@]}" bench rasterize "$folder/first_$name/scene.ply" --capture "$capture" "${measure[@]}" --json "$folder/rasterize_first_$name.json"
+            "${splat[@]}" bench rasterize "$folder/first_$name/scene.ply" --capture "$capture" --downscale "$downscale" \
+            --seconds "$seconds" --json "$folder/rasterize_first_$name.json"
         section "gsplat $name" "$folder/gsplat_$name.json" \
             "$python" benches/gsplat_side_by_side.py "$folder/first_$name/scene.ply" "$capture" --downscale "$downscale" \
             --ours "$folder/rasterize_first_$name.json" --ours-step "$folder/step_$name.json" --json "$folder/gsplat_$name.json"
+    }
+    for count in "${synthetic[@]}"; do
+        name=synthetic_$count
+        section "capture $name" - "${splat[@]}" bench capture "$count" "$photo" --out "$folder/$name"
+        section "step $name" "$folder/step_$name.json" \
+            "${splat[@]}" bench step "$folder/$name" --seconds "$seconds" --json "$folder/step_$name.json"
+        beside_gsplat "$name" "$folder/$name" 1
+    done
+    for capture in "${captures[@]}"; do
+        name=$(basename "$capture")
+        beside_gsplat "$name" "$capture" "$downscale"
         last="${steps[${#steps[@]} - 1]}"
         section "gsplat $name after $last" "$folder/gsplat_${name}_$last.json" \
             "$python" benches/gsplat_side_by_side.py "$folder/train_${name}_$last/scene.ply" "$capture" --downscale "$downscale" \

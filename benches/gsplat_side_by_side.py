@@ -11,6 +11,7 @@ and measures nothing.
 Forward is projection, colours and rasterisation of one view; backward that of the mean squared difference to its photo.
 A step is forward, 0.8 L1 + 0.2 (1 - SSIM), backward and Adam; without fused_ssim installed the SSIM is torch's
 convolutions, which is slower: the JSON says which. No density control. Each is timed from an idle device to an idle one.
+Memory is what each allocator counts over all of it.
 """
 
 import argparse
@@ -115,7 +116,15 @@ def read_model(folder):
 
 def train_views(folder, downscale):
     """At most VIEWS of the training views, evenly spread; sizes and intrinsics divided by `downscale`."""
-    views = [view for index, view in enumerate(read_model(folder)) if index % HOLD_OUT]
+    views, split = read_model(folder), Path(folder) / "split.json"
+    if split.exists():
+        try:
+            names = set(json.loads(read(split))["train"])
+        except (KeyError, TypeError, ValueError) as error:
+            sys.exit(f"error: {split}: not a split, an object with the lists train and test: {error!r}")
+        views = [view for view in views if view[0] in names]
+    else:
+        views = [view for index, view in enumerate(views) if index % HOLD_OUT]
     count = min(len(views), VIEWS)
     chosen = [views[i * len(views) // count] for i in range(count)]
     divided = lambda values: tuple(value / downscale for value in values)
@@ -254,6 +263,7 @@ def measure(scene, views, capture, downscale, passes, ours, ours_step):
         "backward_milliseconds": spread(backward),
         "step_milliseconds": spread(steps),
         "peak_bytes": torch.cuda.max_memory_allocated(),
+        "reserved_bytes": torch.cuda.max_memory_reserved(),
         "ours_times_gsplat": {},
     }
     if ours:
@@ -265,7 +275,11 @@ def measure(scene, views, capture, downscale, passes, ours, ours_step):
     if ours_step:
         row = next((row for row in ours_step["rows"] if row["sh_degree"] == degree), None)
         if row:
-            result["ours_times_gsplat"]["step"] = ratio(result["step_milliseconds"], row["milliseconds"])
+            times = result["ours_times_gsplat"]
+            times["step"] = ratio(result["step_milliseconds"], row["milliseconds"])
+            # What was in use at most, ours as seen between stages; and what the allocators took from the device.
+            times["memory in use"] = row["memory"]["most_bytes"] / result["peak_bytes"]
+            times["memory reserved"] = row["memory"]["reserved_bytes"] / result["reserved_bytes"]
     return result
 
 

@@ -251,6 +251,19 @@ fn benches_of_speed_leave_their_figures() {
         assert!(scaling["memory"]["per_gaussian"].as_f64().unwrap() >= 0.0);
     }
     assert!(fs::read_to_string(&svg).unwrap().contains("2k Gaussians"));
+
+    // The same capture, from files.
+    let synthetic = folder.path().join("synthetic");
+    succeed(&splat(&[
+        "bench",
+        "capture",
+        "2000",
+        "3000",
+        "--out",
+        text(&synthetic),
+    ]));
+    let step = figures(&["step", text(&synthetic), "--seconds", "0"]);
+    assert_eq!(step["work"], points[1]["work"]);
 }
 
 #[test]
@@ -305,11 +318,15 @@ fn benches_of_speed_measure_a_device_too() {
 fn benches_refuse_what_they_cannot_measure_in_one_line() {
     let folder = TempDir::new().unwrap();
     let nowhere = folder.path().join("nowhere");
-    let bad: [(&[&str], &str); 5] = [
+    let file = folder.path().join("file");
+    fs::write(&file, []).unwrap();
+    let bad: [(&[&str], &str); 7] = [
         (&["step", text(&nowhere)], "nowhere"),
         (&["rasterize", "a.ply"], "--capture"),
         (&["step", text(&nowhere), "--downscale", "0"], "downscale"),
         (&["scaling", "--gaussians", "10,0"], "--gaussians"),
+        (&["capture", "0", "9x5", "--out", "a"], "GAUSSIANS"),
+        (&["capture", "9", "9x5", "--out", text(&file)], text(&file)),
         (&["performance", "--device", "wgpu"], "--device"),
     ];
     for (arguments, named) in bad {

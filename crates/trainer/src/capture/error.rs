@@ -8,7 +8,7 @@ use std::path::PathBuf;
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CaptureError {
-    /// A file or folder could not be read.
+    /// A file or folder could not be read, or written.
     #[error("{}: {source}", path.display())]
     Io {
         /// The file or folder.

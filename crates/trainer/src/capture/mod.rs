@@ -13,6 +13,7 @@ mod colmap_text;
 mod downscale;
 mod error;
 mod images;
+mod save;
 mod split;
 
 use std::collections::HashMap;

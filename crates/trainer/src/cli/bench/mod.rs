@@ -34,6 +34,7 @@ enum Bench {
     Step(step::StepArgs),
     Rasterize(rasterize::RasterizeArgs),
     Scaling(scaling::ScalingArgs),
+    Capture(scaling::SyntheticArgs),
     Performance(performance::PerformanceArgs),
     Point(scaling::PointArgs),
 }
@@ -45,6 +46,7 @@ pub(super) fn run(args: &BenchArgs, global: &GlobalArgs) -> Result<(), Failure> 
         Bench::Step(args) => step::run(args, global),
         Bench::Rasterize(args) => rasterize::run(args, global),
         Bench::Scaling(args) => scaling::run(args, global),
+        Bench::Capture(args) => scaling::run_synthetic(args),
         Bench::Performance(args) => performance::run(args, global),
         Bench::Point(args) => scaling::run_point(args, global),
     }

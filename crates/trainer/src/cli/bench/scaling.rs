@@ -9,7 +9,7 @@ use clap::Args;
 use super::{DeviceChoice, Failure, GlobalArgs, chosen, print, write_svg};
 use crate::performance::PerformanceError;
 use crate::performance::scaling::{
-    GAUSSIANS, PIXELS, PhotoSize, Point, ScalingReport, measure_point,
+    GAUSSIANS, PIXELS, PhotoSize, Point, ScalingReport, measure_point, synthetic_capture,
 };
 use crate::report::metrics::write_json;
 
@@ -46,6 +46,36 @@ pub(super) struct PointArgs {
     pixels: PhotoSize,
 }
 
+/// Write the synthetic capture of `splat bench scaling`, for other programs to measure
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  splat bench capture 1000000 1920x1080 --out out/synthetic
+  splat bench rasterize out/synthetic --device wgpu")]
+pub(super) struct SyntheticArgs {
+    /// Number of Gaussians
+    gaussians: usize,
+    /// Number of pixels, or a size such as 1920x1080
+    pixels: PhotoSize,
+    /// Folder of the capture
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+}
+
+/// Writes a synthetic capture.
+pub(super) fn run_synthetic(args: &SyntheticArgs) -> Result<(), Failure> {
+    check_gaussians("GAUSSIANS", &[args.gaussians])?;
+    synthetic_capture(args.gaussians, args.pixels).save(&args.out)?;
+    print(&format!("{}\n", args.out.display()));
+    Ok(())
+}
+
+fn check_gaussians(name: &str, gaussians: &[usize]) -> Result<(), Failure> {
+    match gaussians.contains(&0) {
+        true => Err(Failure::BadInput(format!("{name} must be at least 1"))),
+        false => Ok(()),
+    }
+}
+
 /// Runs the command.
 pub(super) fn run(args: &ScalingArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let report = report(&args.gaussians, &args.pixels, global)?;
@@ -72,11 +102,7 @@ pub(super) fn report(
     sizes: &[PhotoSize],
     global: &GlobalArgs,
 ) -> Result<ScalingReport, Failure> {
-    if gaussians.contains(&0) {
-        return Err(Failure::BadInput(
-            "--gaussians must be at least 1".to_owned(),
-        ));
-    }
+    check_gaussians("--gaussians", gaussians)?;
     let device = chosen(global)?;
     let mut done = 0;
     let start = Instant::now();

@@ -129,7 +129,7 @@ fn view(index: usize, width: u32, height: u32) -> View {
         })
         .collect();
     View {
-        name: format!("view {index}"),
+        name: format!("view {index}.png"),
         width,
         height,
         intrinsics: [w, w, 0.5 * w, 0.5 * h],
