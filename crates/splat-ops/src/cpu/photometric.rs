@@ -6,7 +6,7 @@ mod rows;
 mod sweep;
 
 use core::marker::PhantomData;
-use core::ops::Range;
+use core::ops::RangeInclusive;
 
 use burn::backend::flex::FlexTensor;
 use burn::backend::{Flex, TensorMetadata};
@@ -20,8 +20,9 @@ use crate::ssim::SsimArgs;
 use pictures::{Pictures, spread};
 use sweep::{Scratch, Sweep};
 
-/// Rows per unit of parallel work. Fixed, so that sums are the same on any number of threads.
-const BAND: usize = 64;
+/// Rows per unit of parallel work. What lies under the window beyond a band is computed by both neighbours, which makes few
+/// rows dear; many leave nothing to share out at the end.
+const BAND: RangeInclusive<usize> = 32..=128;
 
 /// The mean absolute difference, and one less the mean similarity: `[2]`.
 pub(super) fn measure<T: Real>(
@@ -53,29 +54,36 @@ fn means<T: Real>(
 ) -> FlexTensor {
     let [b, h, w, d] = pictures.shape;
     let sweep = Sweep::<T>::new(pictures, args);
-    let mut bands: Vec<Band<T>> = (0..b)
-        .flat_map(|image| (0..h).step_by(BAND).map(move |first| (image, first)))
-        .map(|(image, first)| Band {
-            image,
-            rows: first..(first + BAND).min(h),
-            slope: None,
+    let band = rows_of_band(b * h);
+    // By row, and so the same however many bands there are.
+    let mut sums = vec![[0.0; 2]; b * h];
+    let mut bands: Vec<Band<T>> = sums
+        .chunks_mut(h.max(1))
+        .enumerate()
+        .flat_map(|(image, sums)| {
+            let bands = sums.chunks_mut(band).enumerate();
+            bands.map(move |(index, sums)| Band {
+                image,
+                first: index * band,
+                sums,
+                slope: None,
+            })
         })
         .collect();
     if let Some(slope) = slope {
-        let parts = slope.chunks_of_each(b, BAND * w * d);
+        let parts = slope.chunks_of_each(b, band * w * d);
         for (band, (.., part)) in bands.iter_mut().zip(parts) {
             band.slope = Some(part);
         }
     }
-    let sums: Vec<[f64; 2]> = bands
+    bands
         .into_par_iter()
         // Or else the last bands would often be worked on by one thread alone.
         .with_max_len(1)
-        .map_init(Scratch::default, |scratch, band| {
+        .for_each_init(Scratch::default, |scratch, band| {
             let slope = band.slope.map(Part::overwritten);
-            sweep.band(band.image, band.rows, slope, scratch)
-        })
-        .collect();
+            sweep.band(band.image, band.first, band.sums, slope, scratch);
+        });
     let counts = [b * h * w * d, sweep.count];
     let [l1, ssim] = [0, 1].map(|i| {
         let sum: f64 = sums.iter().map(|sums| sums[i]).sum();
@@ -84,10 +92,17 @@ fn means<T: Real>(
     tensor(vec![T::of(l1), T::of(1.0 - ssim)], [2])
 }
 
-/// Rows of one image, and where the gradient of the similarity goes, if anywhere.
+/// Two bands for each thread if they are neither too small nor too large.
+fn rows_of_band(rows: usize) -> usize {
+    let even = rows.div_ceil(2 * rayon::current_num_threads());
+    even.next_multiple_of(2).clamp(*BAND.start(), *BAND.end())
+}
+
+/// Rows of one image: their sums, and where the gradient of the similarity goes, if anywhere.
 struct Band<'a, T> {
     image: usize,
-    rows: Range<usize>,
+    first: usize,
+    sums: &'a mut [[f64; 2]],
     slope: Option<Part<'a, T>>,
 }
 

@@ -55,29 +55,29 @@ impl<'a, T: Real> Sweep<'a, T> {
         }
     }
 
-    /// Sums of absolute difference and similarity over `rows` of an image. `slope` is the memory of these rows, for the
-    /// gradient of the mean similarity.
+    /// Adds the absolute differences and the similarities of rows of an image to the `sums` of each, which has the rows from
+    /// `first` on. `slope` is the memory of these rows, for the gradient of the mean similarity.
     pub(super) fn band(
         &self,
         image: usize,
-        rows: Range<usize>,
+        first: usize,
+        sums: &mut [[f64; 2]],
         mut slope: Option<&mut [T]>,
         scratch: &mut Scratch<T>,
-    ) -> [f64; 2] {
+    ) {
         let (width, channels) = (self.rows.width, self.rows.channels);
-        let rows = rows.start as isize..rows.end as isize;
+        let rows = first as isize..(first + sums.len()) as isize;
         let radius = (self.window.len() / 2) as isize;
         // Rows of fields that a gradient needs beyond its own.
         let reach = if slope.is_some() { radius } else { 0 };
         let strips = width.div_ceil(STRIP);
-        let mut sums = [0.0; 2];
         for index in 0..strips {
             let columns = index * width / strips..(index + 1) * width / strips;
             let strip = Strip::new(self, image, columns.clone());
             scratch.reserve(strip.ring(), strip.length);
             let mut count = |sum: usize, row: isize, value: f64| {
                 if rows.contains(&row) {
-                    sums[sum] += value;
+                    sums[(row - rows.start) as usize][sum] += value;
                 }
             };
             for row in (rows.start - reach - radius..rows.end + reach + radius).step_by(2) {
@@ -104,7 +104,6 @@ impl<'a, T: Real> Sweep<'a, T> {
                 }
             }
         }
-        sums
     }
 }
 
