@@ -152,6 +152,13 @@ section build - cargo build --release --workspace --bin splat ${features[@]+"${f
 section tests - env SPLAT_REQUIRE_WGPU=1 cargo test --release --workspace ${features[@]+"${features[@]}"} ${tests[@]+"${tests[@]}"}
 section gradcheck "$folder/gradcheck.json" \
     "${splat[@]}" gradcheck tests/fixtures/*.safetensors --json "$folder/gradcheck.json"
+# All kernels of an image and its gradients, under NVIDIA's checker if CUDA's toolkit is there.
+if [[ $device == cuda ]] && command -v compute-sanitizer >/dev/null; then
+    for tool in memcheck racecheck; do
+        section "$tool" - compute-sanitizer --tool "$tool" --error-exitcode 1 \
+            "${splat[@]}" gradcheck tests/fixtures/*.safetensors
+    done
+fi
 if $accuracy; then
     section accuracy "$folder/accuracy.json" "${splat[@]}" bench accuracy --json "$folder/accuracy.json"
 fi
