@@ -204,6 +204,7 @@ if [[ -n $python ]]; then
     }
     for count in "${synthetic[@]}"; do
         name=synthetic_$count
+        rm -rf "${folder:?}/$name"
         section "capture $name" - "${splat[@]}" bench capture "$count" "$photo" --out "$folder/$name"
         section "step $name" "$folder/step_$name.json" \
             "${splat[@]}" bench step "$folder/$name" --seconds "$seconds" --json "$folder/step_$name.json"

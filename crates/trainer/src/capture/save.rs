@@ -1,6 +1,6 @@
 //! Writes a capture into a folder as [`Capture::load`] and COLMAP read it: photos, a binary model, and the split.
 
-use std::io::Cursor;
+use std::io::{Cursor, Error, ErrorKind};
 use std::path::Path;
 
 use glam::{DMat3, DQuat};
@@ -19,8 +19,17 @@ impl Capture {
     ///
     /// # Errors
     ///
-    /// [`CaptureError::Io`] if a file cannot be written, or a view's `image` is not of its size.
+    /// [`CaptureError::Io`] if there is a model in `root` already, which may be all that is left of somebody's photos, if a
+    /// file cannot be written, or if a view's `image` is not of its size.
     pub fn save(&self, root: &Path) -> Result<(), CaptureError> {
+        let model = root.join("sparse");
+        if model.exists() {
+            let there = "there is a capture already; choose another folder";
+            return Err(CaptureError::Io {
+                path: model,
+                source: Error::new(ErrorKind::AlreadyExists, there),
+            });
+        }
         let write = |path: &Path, bytes: &[u8]| {
             let path = root.join(path);
             write_atomically(&path, bytes).map_err(|source| CaptureError::Io { path, source })
@@ -107,7 +116,7 @@ fn png(view: &View) -> std::io::Result<Vec<u8>> {
     let pixels = 3 * view.width as usize * view.height as usize;
     if view.image.len() != pixels {
         let wrong = format!("{} bytes for {pixels} values", view.image.len());
-        return Err(std::io::Error::other(wrong));
+        return Err(Error::other(wrong));
     }
     image::write_buffer_with_format(
         &mut out,
@@ -117,7 +126,7 @@ fn png(view: &View) -> std::io::Result<Vec<u8>> {
         ExtendedColorType::Rgb8,
         ImageFormat::Png,
     )
-    .map_err(std::io::Error::other)?;
+    .map_err(Error::other)?;
     Ok(out.into_inner())
 }
 
@@ -158,8 +167,15 @@ mod tests {
             }
         }
 
+        // Nothing is written over.
+        let error = capture.save(from.path()).unwrap_err().to_string();
+        assert!(error.contains("sparse: there is a capture"), "{error}");
+        assert!(!from.path().join("split.json").exists());
+
+        let to = tempfile::tempdir().unwrap();
         Arc::make_mut(&mut capture.views[2].image).pop();
         let error = capture.save(to.path()).unwrap_err().to_string();
         assert!(error.contains(&capture.views[2].name), "{error}");
+        assert!(!to.path().join("sparse").exists());
     }
 }
