@@ -54,8 +54,8 @@ impl Rendered {
 /// mean, inverse Cholesky factor, colour and opacity; depth and extent only order and cull.
 ///
 /// # Errors
-/// When shapes, types or devices do not fit, when a setting is out of range, when the splats touch more tiles than one call can list
-/// ([`OpError::TooManyPairs`]), and when the device fails.
+/// When shapes, types or devices do not fit, when a setting is out of range, when the splats touch more tiles than one call
+/// can list ([`OpError::TooManyPairs`]), and when the device fails.
 pub fn rasterize<const DC: usize, const DO: usize>(
     projected: &Projected,
     colors: Tensor<DC>,

@@ -5,9 +5,7 @@ use core::iter::Sum;
 use core::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
 
 use burn::tensor::Element;
-use macerator::{
-    Scalar, Simd, VAdd, VDiv, VMaskReduce, VMul, VMulAdd, VOrd, VSelect, VSub, Vector,
-};
+use macerator::{Scalar, Simd, VAdd, VMaskReduce, VMul, VMulAdd, VOrd, VSelect, VSub, Vector};
 
 use super::buffer::Overwritten;
 
@@ -33,7 +31,6 @@ pub(crate) trait Real:
     + VAdd
     + VSub
     + VMul
-    + VDiv
     + VMulAdd
     + VOrd
     + VSelect

@@ -95,16 +95,12 @@ impl<T: Real> Batch<T> {
         self.splats[usize::from(place)]
     }
 
-    /// Some channels of their colours, from a first one on.
+    /// Some channels of their colours that they do not have with them, from a first one on.
     #[inline(always)]
     pub(super) fn colors(&self, block: usize, first: usize) -> impl Iterator<Item = [T; GROUP]> {
         let places = self.places.of(block).iter();
-        let further = (first / GROUP).checked_sub(1);
-        let further = further.map(|group| &self.further_colors[group]);
-        places.map(move |place| match further {
-            None => self.splat(*place).color,
-            Some(colors) => colors[usize::from(*place)],
-        })
+        let colors = &self.further_colors[first / GROUP - 1];
+        places.map(|place| colors[usize::from(*place)])
     }
 }
 

@@ -322,15 +322,15 @@ impl<T: Real> BlendTile<T> {
             let rows = T::transposed([red, green, blue, alpha]);
             pixels.copy_from_slice(rows.as_flattened());
         }
-        self.store_pixels(row, first + whole.len(), rest, channels);
+        self.store_pixels(row, SIDE * whole.len(), rest, channels);
     }
 
-    /// Writes pixels of a row of the tile, of any number of channels, from those of a block on.
+    /// Writes pixels of a row of the tile, of any number of channels, from a column on.
     // By itself: what its loops need to remember would take the registers of the other one.
     #[inline(never)]
-    fn store_pixels(&self, row: usize, first: usize, image: &mut [T], channels: usize) {
+    fn store_pixels(&self, row: usize, column: usize, image: &mut [T], channels: usize) {
         for (i, pixel) in image.chunks_exact_mut(channels + 1).enumerate() {
-            let [block, lane] = [first + i / SIDE, row % SIDE * SIDE + i % SIDE];
+            let [block, lane] = in_blocks(column + i, row);
             let (color, alpha) = pixel.split_at_mut(channels);
             for (out, plane) in color.iter_mut().zip(&self.colors[block * channels..]) {
                 *out = plane.0[lane];

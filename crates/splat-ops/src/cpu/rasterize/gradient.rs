@@ -30,8 +30,8 @@ use super::View;
 use super::batch::{BATCH, Batch, ByPlace, by_groups};
 use super::pixels::{Columns, Pixels, four_totals, load_each, total};
 use super::splat::{
-    ACROSS, Aligned, BLOCKS, Centres, GROUP, LANES, Lanes, SIDE, Thresholds, corner, row_mut,
-    row_of, square,
+    ACROSS, Aligned, BLOCKS, Centres, GROUP, LANES, Lanes, SIDE, Thresholds, corner, in_blocks,
+    row_mut, row_of, square,
 };
 use super::trace::{ByBlock, TileTrace};
 
@@ -140,15 +140,15 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
             }
             *row_mut(&mut behind.0, row % SIDE) = alpha;
         }
-        self.load_pixels(row, first + whole.len(), rest, channels);
+        self.load_pixels(row, SIDE * whole.len(), rest, channels);
     }
 
-    /// Reads pixels of a row of the tile, of any number of channels, from those of a block on.
+    /// Reads pixels of a row of the tile, of any number of channels, from a column on.
     // By itself: what its loops need to remember would take the registers of the other one.
     #[inline(never)]
-    fn load_pixels(&mut self, row: usize, first: usize, grad: &[T], channels: usize) {
+    fn load_pixels(&mut self, row: usize, column: usize, grad: &[T], channels: usize) {
         for (i, grad) in grad.chunks_exact(channels + 1).enumerate() {
-            let [block, lane] = [first + i / SIDE, row % SIDE * SIDE + i % SIDE];
+            let [block, lane] = in_blocks(column + i, row);
             let planes = &mut self.grad[block * channels..];
             for (plane, grad) in planes.iter_mut().zip(&grad[..channels]) {
                 plane.0[lane] = *grad;

@@ -12,51 +12,81 @@ use super::splat::{Aligned, LANES, Lanes, SIDE};
 // No closure: the compiler must put every function between the instructions and the one that is compiled for them into the
 // latter, and knows no way to be told so of closures.
 macro_rules! each_register {
-    ($type:ident, $i:ident => $value:expr) => {{
-        let mut result = $type([T::ZERO.splat(); _]);
-        for $i in 0..$type::<S, T>::registers() {
+    ($i:ident => $value:expr) => {{
+        let mut result = Registers([T::ZERO.splat(); _]);
+        for $i in 0..result.used() {
             result.0[$i] = $value;
         }
         result
     }};
 }
 
-/// One value per pixel of a block, in as many registers as it takes.
-// An array as long as registers of one lane would make it, as their length has to be known; the compiler drops what is not used.
-pub(super) struct Pixels<S: Simd, T: Real>([Vector<S, T>; LANES]);
+/// Some values of one block, side by side in as many registers as it takes.
+// An array as long as registers of one lane would make it, as its length has to be known; the compiler drops what is not used.
+pub(super) struct Registers<S: Simd, T: Real, const VALUES: usize>([Vector<S, T>; VALUES]);
 
-impl<S: Simd, T: Real> Clone for Pixels<S, T> {
+/// One value per pixel of a block.
+pub(super) type Pixels<S, T> = Registers<S, T, LANES>;
+
+/// One value per column of a block: in one register, or more where they are narrower than a row. A wider one holds it once
+/// for every row.
+pub(super) type Columns<S, T> = Registers<S, T, SIDE>;
+
+impl<S: Simd, T: Real, const VALUES: usize> Clone for Registers<S, T, VALUES> {
     #[inline(always)]
     fn clone(&self) -> Self {
         *self
     }
 }
 
-impl<S: Simd, T: Real> Copy for Pixels<S, T> {}
+impl<S: Simd, T: Real, const VALUES: usize> Copy for Registers<S, T, VALUES> {}
 
-impl<S: Simd, T: Real> Pixels<S, T> {
+impl<S: Simd, T: Real, const VALUES: usize> Registers<S, T, VALUES> {
+    /// How many registers that are.
     #[inline(always)]
-    fn registers() -> usize {
-        LANES / T::lanes::<S>()
+    fn used(&self) -> usize {
+        VALUES.div_ceil(T::lanes::<S>())
     }
 
-    #[inline(always)]
-    pub(super) fn splat(value: T) -> Self {
-        Self([value.splat(); LANES])
-    }
-
+    /// Of every pixel, or of every column from pixels whose rows are alike.
     #[inline(always)]
     pub(super) fn load(lanes: &Lanes<T>) -> Self {
-        each_register!(Pixels, i => register(lanes, i))
+        each_register!(i => register(lanes, i))
     }
 
+    /// As [`load`](Self::load) takes it.
     #[inline(always)]
     pub(super) fn store(self, lanes: &mut Lanes<T>) {
-        for i in 0..Self::registers() {
+        for i in 0..self.used() {
             store_register(self.0[i], lanes, i);
         }
     }
 
+    #[inline(always)]
+    pub(super) fn splat(value: T) -> Self {
+        Self([value.splat(); VALUES])
+    }
+
+    #[inline(always)]
+    pub(super) fn plus(self, other: Self) -> Self {
+        each_register!(i => self.0[i] + other.0[i])
+    }
+
+    #[inline(always)]
+    pub(super) fn times(self, other: Self) -> Self {
+        each_register!(i => self.0[i] * other.0[i])
+    }
+
+    /// `sum + self b`, summed over the registers.
+    #[inline(always)]
+    pub(super) fn times_add_to(self, b: Self, sum: &mut Vector<S, T>) {
+        for i in 0..self.used() {
+            *sum = self.0[i].mul_add(b.0[i], *sum);
+        }
+    }
+}
+
+impl<S: Simd, T: Real> Pixels<S, T> {
     #[inline(always)]
     pub(super) fn lanes(self) -> Lanes<T> {
         let mut lanes = [T::ZERO; LANES];
@@ -65,30 +95,20 @@ impl<S: Simd, T: Real> Pixels<S, T> {
     }
 
     #[inline(always)]
-    pub(super) fn plus(self, other: Self) -> Self {
-        each_register!(Pixels, i => self.0[i] + other.0[i])
-    }
-
-    #[inline(always)]
     pub(super) fn minus(self, other: Self) -> Self {
-        each_register!(Pixels, i => self.0[i] - other.0[i])
-    }
-
-    #[inline(always)]
-    pub(super) fn times(self, other: Self) -> Self {
-        each_register!(Pixels, i => self.0[i] * other.0[i])
+        each_register!(i => self.0[i] - other.0[i])
     }
 
     /// The lesser one; the other if one is NaN, or NaN, as the processor has it.
     #[inline(always)]
     pub(super) fn least(self, other: Self) -> Self {
-        each_register!(Pixels, i => self.0[i].min(other.0[i]))
+        each_register!(i => self.0[i].min(other.0[i]))
     }
 
     /// `self b + c`, in one rounding where that is one instruction.
     #[inline(always)]
     pub(super) fn times_plus(self, b: Self, c: Self) -> Self {
-        each_register!(Pixels, i => self.0[i].mul_add(b.0[i], c.0[i]))
+        each_register!(i => self.0[i].mul_add(b.0[i], c.0[i]))
     }
 
     /// `c - self b`, likewise.
@@ -96,34 +116,34 @@ impl<S: Simd, T: Real> Pixels<S, T> {
     pub(super) fn times_from(self, b: Self, c: Self) -> Self {
         // Subtracted from -0, which is how a compiler knows a change of sign; it becomes part of the instruction.
         let sign = T::of(-0.0).splat();
-        each_register!(Pixels, i => (sign - self.0[i]).mul_add(b.0[i], c.0[i]))
+        each_register!(i => (sign - self.0[i]).mul_add(b.0[i], c.0[i]))
     }
 
     /// `2^-self`, see [`Real::exp2_neg`].
     #[inline(always)]
     pub(super) fn exp2_neg(self) -> Self {
         let mut powers = self;
-        T::exp2_neg(&mut powers.0[..Self::registers()]);
+        T::exp2_neg(&mut powers.0[..self.used()]);
         powers
     }
 
     /// What is here where `values >= bound`, and zero elsewhere.
     #[inline(always)]
     pub(super) fn where_at_least(self, values: Self, bound: Self) -> Self {
-        each_register!(Pixels, i => kept(values.0[i].ge(bound.0[i]), self.0[i]))
+        each_register!(i => kept(values.0[i].ge(bound.0[i]), self.0[i]))
     }
 
     /// What is here where `values < bound`, and zero elsewhere.
     #[inline(always)]
     pub(super) fn where_below(self, values: Self, bound: Self) -> Self {
-        each_register!(Pixels, i => kept(values.0[i].lt(bound.0[i]), self.0[i]))
+        each_register!(i => kept(values.0[i].lt(bound.0[i]), self.0[i]))
     }
 
     /// Whether any pixel is below.
     #[inline(always)]
     pub(super) fn any_below(self, bound: T) -> bool {
         let mut least = self.0[0];
-        for i in 1..Self::registers() {
+        for i in 1..self.used() {
             least = least.min(self.0[i]);
         }
         least.lt(bound.splat()).any()
@@ -132,92 +152,30 @@ impl<S: Simd, T: Real> Pixels<S, T> {
     /// Sums over the rows.
     #[inline(always)]
     pub(super) fn column_sums(self) -> Columns<S, T> {
-        let mut sums = Columns([T::ZERO.splat(); SIDE]);
-        let count = Columns::<S, T>::registers();
+        let mut sums = Columns::splat(T::ZERO);
+        let count = sums.used();
         for i in 0..count {
             sums.0[i] = self.0[i];
-            for row in (i + count..Self::registers()).step_by(count) {
+            for row in (i + count..self.used()).step_by(count) {
                 sums.0[i] += self.0[row];
             }
         }
         sums
     }
-
-    /// `sum + self b`, summed over the registers.
-    #[inline(always)]
-    pub(super) fn times_add_to(self, b: Self, sum: &mut Vector<S, T>) {
-        for i in 0..Self::registers() {
-            *sum = self.0[i].mul_add(b.0[i], *sum);
-        }
-    }
 }
-
-/// One value per column of a block: of one register, or more where they are narrower than a row.
-pub(super) struct Columns<S: Simd, T: Real>([Vector<S, T>; SIDE]);
-
-impl<S: Simd, T: Real> Clone for Columns<S, T> {
-    #[inline(always)]
-    fn clone(&self) -> Self {
-        *self
-    }
-}
-
-impl<S: Simd, T: Real> Copy for Columns<S, T> {}
 
 impl<S: Simd, T: Real> Columns<S, T> {
-    #[inline(always)]
-    fn registers() -> usize {
-        SIDE.div_ceil(T::lanes::<S>())
-    }
-
-    /// From pixels whose rows are alike.
-    #[inline(always)]
-    pub(super) fn load(lanes: &Lanes<T>) -> Self {
-        each_register!(Columns, i => register(lanes, i))
-    }
-
-    /// As [`load`](Self::load) takes it.
-    #[inline(always)]
-    pub(super) fn store(self, lanes: &mut Lanes<T>) {
-        for i in 0..Self::registers() {
-            store_register(self.0[i], lanes, i);
-        }
-    }
-
     /// The same in every row.
     #[inline(always)]
     pub(super) fn pixels(self) -> Pixels<S, T> {
-        each_register!(Pixels, i => self.0[i % Self::registers()])
-    }
-
-    #[inline(always)]
-    pub(super) fn plus(self, value: T) -> Self {
-        each_register!(Columns, i => self.0[i] + value.splat())
-    }
-
-    #[inline(always)]
-    pub(super) fn scaled(self, value: T) -> Self {
-        each_register!(Columns, i => self.0[i] * value.splat())
-    }
-
-    #[inline(always)]
-    pub(super) fn times(self, other: Self) -> Self {
-        each_register!(Columns, i => self.0[i] * other.0[i])
+        each_register!(i => self.0[i % self.used()])
     }
 
     /// `sum + self`, summed over the registers.
     #[inline(always)]
     pub(super) fn add_to(self, sum: &mut Vector<S, T>) {
-        for i in 0..Self::registers() {
+        for i in 0..self.used() {
             *sum += self.0[i];
-        }
-    }
-
-    /// `sum + self b`, summed over the registers.
-    #[inline(always)]
-    pub(super) fn times_add_to(self, b: Self, sum: &mut Vector<S, T>) {
-        for i in 0..Self::registers() {
-            *sum = self.0[i].mul_add(b.0[i], *sum);
         }
     }
 }

@@ -196,10 +196,11 @@ impl<T: Real> Splat<T> {
     #[inline(always)]
     pub(super) fn z<S: Simd>(&self, centres: &Centres<S, T>) -> (Columns<S, T>, Pixels<S, T>) {
         let [x, y] = self.mean;
-        let dx = centres.x.plus(-x);
+        let dx = centres.x.plus(Columns::splat(-x));
         let dy = centres.y.plus(Pixels::splat(-y));
-        let z2 = Pixels::splat(self.w22).times_plus(dy, dx.scaled(self.w21).pixels());
-        (dx.scaled(self.w11), z2)
+        let z2 =
+            Pixels::splat(self.w22).times_plus(dy, dx.times(Columns::splat(self.w21)).pixels());
+        (dx.times(Columns::splat(self.w11)), z2)
     }
 
     /// Raw alphas at the pixels of a block, given the falloffs `2^-|z|^2`.
@@ -241,7 +242,7 @@ impl<S: Simd, T: Real> Centres<S, T> {
         let x = Columns::load(&core::array::from_fn(|i| within(i % SIDE)));
         let y = Pixels::load(&core::array::from_fn(|i| within(i / SIDE)));
         Self {
-            x: x.plus(from(left, block % ACROSS)),
+            x: x.plus(Columns::splat(from(left, block % ACROSS))),
             y: y.plus(Pixels::splat(from(top, block / ACROSS))),
         }
     }
