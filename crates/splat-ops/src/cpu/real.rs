@@ -74,6 +74,12 @@ pub(crate) trait Real:
         core::array::from_fn(|i| core::array::from_fn(|j| rows[j][i]))
     }
 
+    /// Sums of four pairs.
+    #[inline(always)]
+    fn sums(a: [Self; 4], b: [Self; 4]) -> [Self; 4] {
+        core::array::from_fn(|i| a[i] + b[i])
+    }
+
     /// The lesser one; the second if the first is NaN.
     #[inline(always)]
     fn least(self, other: Self) -> Self {
@@ -233,6 +239,14 @@ impl Real for f32 {
             ]
         };
         bytemuck::cast(columns)
+    }
+    // The compiler would take the four apart, to join them again in another way.
+    #[cfg(target_arch = "x86_64")]
+    #[inline(always)]
+    fn sums(a: [f32; 4], b: [f32; 4]) -> [f32; 4] {
+        use core::arch::x86_64::_mm_add_ps;
+        // SAFETY: every 64-bit x86 processor has it.
+        bytemuck::cast(unsafe { _mm_add_ps(bytemuck::cast(a), bytemuck::cast(b)) })
     }
     #[inline(always)]
     fn exp<const FMA: bool>(x: Self) -> Self {

@@ -119,6 +119,7 @@ impl Places {
         }
     }
 
+    #[inline(always)]
     pub(super) fn of(&self, block: usize) -> &[u8] {
         &self.places[block][..self.counts[block]]
     }

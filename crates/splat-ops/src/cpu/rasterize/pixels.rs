@@ -204,26 +204,21 @@ pub(super) fn total<S: Simd, T: Real>(register: Vector<S, T>) -> T {
 pub(super) fn four_totals<S: Simd, T: Real>(registers: [Vector<S, T>; 4]) -> [T; 4] {
     let [a, b, c, d] = registers;
     let [a, b, c, d] = T::transposed([quarters(a), quarters(b), quarters(c), quarters(d)]);
-    let mut totals = [T::ZERO; 4];
-    for i in 0..4 {
-        totals[i] = (a[i] + c[i]) + (b[i] + d[i]);
-    }
-    totals
+    T::sums(T::sums(a, c), T::sums(b, d))
 }
 
 /// A register's lanes added up to four, zeros where there are fewer.
 #[inline(always)]
 fn quarters<S: Simd, T: Real>(register: Vector<S, T>) -> [T; 4] {
-    let mut sums = [T::ZERO; LANES];
-    let mut width = T::lanes::<S>();
-    sums[..width].copy_from_slice(bytemuck::cast_slice(core::slice::from_ref(&register)));
-    while width > 4 {
-        width /= 2;
-        for i in 0..width {
-            sums[i] += sums[i + width];
-        }
+    let mut lanes = [T::ZERO; LANES];
+    let width = T::lanes::<S>();
+    lanes[..width].copy_from_slice(bytemuck::cast_slice(core::slice::from_ref(&register)));
+    let fours = lanes.as_chunks().0;
+    match width {
+        16 => T::sums(T::sums(fours[0], fours[2]), T::sums(fours[1], fours[3])),
+        8 => T::sums(fours[0], fours[1]),
+        _ => fours[0],
     }
-    [sums[0], sums[1], sums[2], sums[3]]
 }
 
 /// Several.
