@@ -194,33 +194,54 @@ impl<T: Real> BlendTile<T> {
         tally: &mut impl Tally,
     ) -> usize {
         let gate = Pixels::<S, T>::load(&self.gate[block].0);
-        let mut before = Pixels::load(&self.transmittance[block].0);
         let planes = &mut self.colors[block * channels..][..COUNT];
-        let mut sums = load_each::<S, T, COUNT>(planes);
+        let mut light = Light {
+            left: Pixels::load(&self.transmittance[block].0),
+            colors: load_each::<S, T, COUNT>(planes),
+        };
         let mut done = 0;
-        let reaching = self.batch.reaching(block, splats.clone());
-        for (falloffs, splat) in self.weights[splats].iter_mut().zip(reaching) {
-            let raw = splat.raw(Pixels::load(&falloffs.0));
-            let share = thresholds.share(raw, gate);
-            // Without a share nothing changes, exactly.
-            let left = share.times_from(before, before);
-            if left.any_below(thresholds.transmittance_min) {
-                break;
+        let places = &self.batch.places.of(block)[splats.clone()];
+        let falloffs = &mut self.weights[splats];
+        // Where one register holds a block, there are enough of them to remember what was before several splats, and to ask
+        // only behind the last of these whether a pixel stops.
+        if T::lanes::<S>() == LANES && channels <= GROUP {
+            let fours = places.as_chunks::<4>().0.iter();
+            for (places, falloffs) in fours.zip(falloffs.as_chunks::<4>().0) {
+                let mut behind = light;
+                let mut raws = [gate; 4];
+                for i in 0..4 {
+                    let splat = self.batch.splat(places[i]);
+                    raws[i] = splat.raw(Pixels::load(&falloffs[i].0));
+                    behind.pass(thresholds.share(raws[i], gate), &splat.color);
+                }
+                if behind.left.any_below(thresholds.transmittance_min) {
+                    break;
+                }
+                for raw in raws {
+                    tally.blended(|| of_each(raw, gate));
+                }
+                light = behind;
+                done += 4;
             }
-            let weights = share.times(before);
-            for (sum, color) in sums.iter_mut().zip(splat.color) {
-                *sum = weights.times_plus(Pixels::splat(color), *sum);
+        }
+        for (place, falloffs) in places[done..].iter().zip(&mut falloffs[done..]) {
+            let splat = self.batch.splat(*place);
+            let raw = splat.raw(Pixels::load(&falloffs.0));
+            let mut behind = light;
+            let weights = behind.pass(thresholds.share(raw, gate), &splat.color);
+            if behind.left.any_below(thresholds.transmittance_min) {
+                break;
             }
             if channels > GROUP {
                 weights.store(&mut falloffs.0);
             }
             tally.blended(|| of_each(raw, gate));
-            before = left;
+            light = behind;
             done += 1;
         }
-        before.store(&mut self.transmittance[block].0);
-        for (plane, sum) in planes.iter_mut().zip(sums) {
-            sum.store(&mut plane.0);
+        light.left.store(&mut self.transmittance[block].0);
+        for (plane, color) in planes.iter_mut().zip(light.colors) {
+            color.store(&mut plane.0);
         }
         done
     }
@@ -337,6 +358,37 @@ impl<T: Real> BlendTile<T> {
             }
             alpha[0] = T::ONE - self.transmittance[block].0[lane];
         }
+    }
+}
+
+/// What is on its way to the pixels of a block, and what of it has arrived.
+struct Light<S: Simd, T: Real, const COUNT: usize> {
+    /// Transmittance.
+    left: Pixels<S, T>,
+    /// Of a group of channels.
+    colors: [Pixels<S, T>; COUNT],
+}
+
+impl<S: Simd, T: Real, const COUNT: usize> Clone for Light<S, T, COUNT> {
+    #[inline(always)]
+    fn clone(&self) -> Self {
+        *self
+    }
+}
+
+impl<S: Simd, T: Real, const COUNT: usize> Copy for Light<S, T, COUNT> {}
+
+impl<S: Simd, T: Real, const COUNT: usize> Light<S, T, COUNT> {
+    /// Passes a splat that takes a share of it; returns the share of all light that the splat sends.
+    #[inline(always)]
+    fn pass(&mut self, share: Pixels<S, T>, color: &[T; GROUP]) -> Pixels<S, T> {
+        let weights = share.times(self.left);
+        // Without a share nothing changes, exactly.
+        self.left = share.times_from(self.left, self.left);
+        for (sum, color) in self.colors.iter_mut().zip(color) {
+            *sum = weights.times_plus(Pixels::splat(*color), *sum);
+        }
+        weights
     }
 }
 
