@@ -25,11 +25,13 @@ use core::marker::PhantomData;
 use std::sync::Arc;
 
 use burn::backend::flex::FlexTensor;
-use macerator::{Simd, with_simd};
+use macerator::{Arch, Simd, Vector, WithSimd, with_simd};
 use rayon::prelude::*;
 use tracing::trace_span;
 
 use super::buffer::{Buffer, tensor, zeros};
+#[cfg(target_arch = "x86_64")]
+use super::instructions::InstructionSet;
 use super::intersect::{CHUNK, Grid, TILE, TileLists};
 use super::parts::{Part, Uncleared};
 use super::real::Real;
@@ -348,8 +350,14 @@ pub(super) fn backward<T: Real>(
             .enumerate()
             .with_max_len(ROWS_AT_ONCE)
             .map(|(ty, partials)| {
-                let partials = partials.overwritten();
-                row_of_tiles_backward(&view, &frame.traces[ty], grad, ty, partials)
+                let row = RowOfTilesBackward {
+                    view: &view,
+                    trace: &frame.traces[ty],
+                    grad,
+                    ty,
+                    partials: partials.overwritten(),
+                };
+                row.run()
             })
             .collect();
         for row in backgrounds {
@@ -372,28 +380,69 @@ pub(super) fn backward<T: Real>(
     ]
 }
 
-/// Writes the sums of one row of tiles; returns its share of the background's gradient.
-#[with_simd]
-fn row_of_tiles_backward<'a, S: Simd, T: Real>(
-    view: &View<'a, T>,
-    trace: &Trace<T>,
-    grad: &[T],
+/// Writes the sums of one row of tiles; gives its share of the background's gradient.
+struct RowOfTilesBackward<'a, T> {
+    view: &'a View<'a, T>,
+    trace: &'a Trace<T>,
+    grad: &'a [T],
     ty: usize,
-    partials: &mut [T],
-) -> Vec<T> {
-    let channels = view.channels;
-    let mut background = vec![T::ZERO; channels];
-    let mut tile = GradientTile::<S, T>::new(channels);
-    let (mut partials, mut first) = (partials, 0);
-    for tx in 0..view.grid.columns {
-        let count = view.list([tx, ty]).len();
-        let (sums, later) = partials.split_at_mut(count * (MOMENTS + channels));
-        let of_tile = trace.tile(tx, first..first + count);
-        (partials, first) = (later, first + count);
-        tile.load(view, grad, [tx, ty], &of_tile, &mut background);
-        tile.walk(view, [tx, ty], &of_tile, sums);
+    partials: &'a mut [T],
+}
+
+impl<T: Real> RowOfTilesBackward<'_, T> {
+    /// With this processor's registers, of 256 bits at most: it writes a splat's sums, which lie in memory, once for every
+    /// block, and wider registers take twice as long for that as for anything else.
+    fn run(self) -> Vec<T> {
+        let set = match Arch::detect() {
+            #[cfg(target_arch = "x86_64")]
+            Arch::V4 => Arch::V3,
+            set => set,
+        };
+        // SAFETY: the processor has them, and what runs AVX-512 runs AVX2 too.
+        unsafe { set.dispatch(self) }
     }
-    background
+
+    /// With AVX-512 there are twice as many registers, of any width.
+    ///
+    /// # Safety
+    /// The processor has [`InstructionSet::Avx512`].
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512dq,avx512vl")]
+    fn walk_with_avx512<S: Simd>(self) -> Vec<T> {
+        self.walk::<S>()
+    }
+
+    #[inline(always)]
+    fn walk<S: Simd>(self) -> Vec<T> {
+        let Self { view, ty, .. } = self;
+        let channels = view.channels;
+        let mut background = vec![T::ZERO; channels];
+        let mut tile = GradientTile::<S, T>::new(channels);
+        let (mut partials, mut first) = (self.partials, 0);
+        for tx in 0..view.grid.columns {
+            let count = view.list([tx, ty]).len();
+            let (sums, later) = partials.split_at_mut(count * (MOMENTS + channels));
+            let of_tile = self.trace.tile(tx, first..first + count);
+            (partials, first) = (later, first + count);
+            tile.load(view, self.grad, [tx, ty], &of_tile, &mut background);
+            tile.walk(view, [tx, ty], &of_tile, sums);
+        }
+        background
+    }
+}
+
+impl<T: Real> WithSimd for RowOfTilesBackward<'_, T> {
+    type Output = Vec<T>;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self) -> Vec<T> {
+        #[cfg(target_arch = "x86_64")]
+        if size_of::<Vector<S, T>>() == 32 && InstructionSet::chosen() == InstructionSet::Avx512 {
+            // SAFETY: as `chosen` says.
+            return unsafe { self.walk_with_avx512::<S>() };
+        }
+        self.walk::<S>()
+    }
 }
 
 /// Gradients of up to [`CHUNK`] Gaussians in one camera.
@@ -435,7 +484,6 @@ impl<T: Real> GradientRows<'_, T> {
 
 #[cfg(test)]
 mod tests {
-    use macerator::{Arch, WithSimd};
     use rand::{RngExt, SeedableRng};
 
     use super::*;
@@ -447,6 +495,8 @@ mod tests {
     struct Both<'a, T> {
         view: &'a View<'a, T>,
         grad: &'a [T],
+        /// Whether the backward pass runs with the registers that it chooses.
+        chosen: bool,
     }
 
     impl<T: Real> WithSimd for Both<'_, T> {
@@ -454,7 +504,7 @@ mod tests {
 
         #[inline(always)]
         fn with_simd<S: Simd>(self) -> Self::Output {
-            let Self { view, grad } = self;
+            let Self { view, grad, .. } = self;
             let mut image = vec![T::ZERO; grad.len()];
             let mut partials = vec![T::ZERO; view.lists.instances() * (MOMENTS + CHANNELS)];
             let mut background = vec![];
@@ -465,8 +515,17 @@ mod tests {
                 let length = view.lists.row_of_tiles(ty, view.grid).len();
                 let (own, rest) = later.split_at_mut(length * (MOMENTS + CHANNELS));
                 later = rest;
-                let row = row_of_tiles_backward_impl::<S, T>(view, &trace, grad, ty, own);
-                background.extend(row);
+                let row = RowOfTilesBackward {
+                    view,
+                    trace: &trace,
+                    grad,
+                    ty,
+                    partials: own,
+                };
+                background.extend(match self.chosen {
+                    true => row.run(),
+                    false => row.walk::<S>(),
+                });
             }
             let wide = |values: Vec<T>| values.into_iter().map(T::wide).collect();
             [wide(image), wide(partials), wide(background)]
@@ -515,20 +574,21 @@ mod tests {
         let view = View::new(&listed, camera.background, &args);
         assert!(view.lists.tile(0).len() > batch::BATCH);
 
-        let both = || Both {
+        let both = |chosen| Both {
             view: &view,
             grad: &grad,
+            chosen,
         };
         let best = Arch::detect();
-        let mut sets = vec![best, Arch::Scalar];
+        let mut sets = vec![(best, true), (best, false), (Arch::Scalar, false)];
         #[cfg(target_arch = "x86_64")]
         if matches!(best, Arch::V3 | Arch::V4) {
             // Whatever runs these runs what came before them.
-            sets.extend([Arch::V2, Arch::V3]);
+            sets.extend([(Arch::V2, false), (Arch::V3, false)]);
         }
-        let mut results = sets.into_iter().map(|set| {
+        let mut results = sets.into_iter().map(|(set, chosen)| {
             // SAFETY: the processor has them.
-            (set, unsafe { set.dispatch(both()) })
+            (set, unsafe { set.dispatch(both(chosen)) })
         });
         let (_, first) = results.next().unwrap();
         let reference = reference.unwrap_or(&first);
