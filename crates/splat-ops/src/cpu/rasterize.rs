@@ -25,13 +25,14 @@ use core::marker::PhantomData;
 use std::sync::Arc;
 
 use burn::backend::flex::FlexTensor;
-use macerator::{Arch, Simd, Vector, WithSimd, with_simd};
+use macerator::{Arch, Simd, Vector, WithSimd};
 use rayon::prelude::*;
 use tracing::trace_span;
 
 use super::buffer::{Buffer, tensor, zeros};
 #[cfg(target_arch = "x86_64")]
 use super::instructions::InstructionSet;
+use super::instructions::registers;
 use super::intersect::{CHUNK, Grid, TILE, TileLists};
 use super::parts::{Part, Uncleared};
 use super::real::Real;
@@ -283,26 +284,47 @@ fn blend<T: Real>(
         .into_par_iter()
         .enumerate()
         .with_max_len(ROWS_AT_ONCE)
-        .map(|(ty, image)| blend_row_of_tiles(&view, ty, image.overwritten()))
+        .map(|(ty, image)| {
+            let row = RowOfTiles {
+                view: &view,
+                ty,
+                image: image.overwritten(),
+            };
+            row.run()
+        })
         .collect();
     Frame { listed, traces }
 }
 
 /// Renders one row of tiles into its part of the image.
-#[with_simd]
-fn blend_row_of_tiles<'a, S: Simd, T: Real>(
-    view: &View<'a, T>,
+struct RowOfTiles<'a, T> {
+    view: &'a View<'a, T>,
     ty: usize,
-    image: &mut [T],
-) -> Trace<T> {
-    let mut tile = BlendTile::new(view.channels);
-    let splats = view.lists.row_of_tiles(ty, view.grid).len();
-    let mut trace = Trace::with_capacity(view.grid.columns, splats);
-    for tx in 0..view.grid.columns {
-        tile.blend::<S>(view, [tx, ty], &mut trace, &mut ());
-        tile.store::<S>(view, [tx, ty], image);
+    image: &'a mut [T],
+}
+
+impl<T: Real> RowOfTiles<'_, T> {
+    fn run(self) -> Trace<T> {
+        // SAFETY: the processor has them.
+        unsafe { registers().dispatch(self) }
     }
-    trace
+}
+
+impl<T: Real> WithSimd for RowOfTiles<'_, T> {
+    type Output = Trace<T>;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self) -> Trace<T> {
+        let Self { view, ty, image } = self;
+        let mut tile = BlendTile::new(view.channels);
+        let splats = view.lists.row_of_tiles(ty, view.grid).len();
+        let mut trace = Trace::with_capacity(view.grid.columns, splats);
+        for tx in 0..view.grid.columns {
+            tile.blend::<S>(view, [tx, ty], &mut trace, &mut ());
+            tile.store::<S>(view, [tx, ty], image);
+        }
+        trace
+    }
 }
 
 pub(super) fn backward<T: Real>(
@@ -390,16 +412,16 @@ struct RowOfTilesBackward<'a, T> {
 }
 
 impl<T: Real> RowOfTilesBackward<'_, T> {
-    /// With this processor's registers, of 256 bits at most: it writes a splat's sums, which lie in memory, once for every
-    /// block, and wider registers take twice as long for that as for anything else.
+    /// In registers of 256 bits at most: it writes a splat's sums, which lie in memory, once for every block, and wider
+    /// registers take twice as long for that as for anything else.
     fn run(self) -> Vec<T> {
-        let set = match Arch::detect() {
+        let registers = match registers() {
             #[cfg(target_arch = "x86_64")]
             Arch::V4 => Arch::V3,
-            set => set,
+            others => others,
         };
-        // SAFETY: the processor has them, and what runs AVX-512 runs AVX2 too.
-        unsafe { set.dispatch(self) }
+        // SAFETY: the processor has them; what runs AVX-512 runs AVX2 too.
+        unsafe { registers.dispatch(self) }
     }
 
     /// With AVX-512 there are twice as many registers, of any width.
@@ -511,7 +533,7 @@ mod tests {
             let slab = TILE * view.width * (CHANNELS + 1);
             let mut later = &mut *partials;
             for (ty, image) in image.chunks_mut(slab).enumerate() {
-                let trace = blend_row_of_tiles_impl::<S, T>(view, ty, image);
+                let trace = RowOfTiles { view, ty, image }.with_simd::<S>();
                 let length = view.lists.row_of_tiles(ty, view.grid).len();
                 let (own, rest) = later.split_at_mut(length * (MOMENTS + CHANNELS));
                 later = rest;

@@ -28,8 +28,8 @@ const WARM_UP: usize = 1;
 const PASSES: usize = 30;
 
 /// 1e9 evaluations per second and core.
+#[derive(Debug, Clone, Copy, PartialEq)]
 struct Limit {
-    instructions: &'static str,
     /// What the arithmetic of the inner loop reached on a machine with AVX-512: a tile of 16 x 16 pixels with 256 splats,
     /// in cache. Not every direction was measured.
     forward: f64,
@@ -39,21 +39,18 @@ struct Limit {
 }
 
 const AVX512: Limit = Limit {
-    instructions: "AVX-512",
     forward: 3.6,
     backward: Some(1.2),
     goal: Some([2.5, 0.8]),
 };
 
 const AVX2: Limit = Limit {
-    instructions: "AVX2",
     forward: 2.0,
     backward: None,
     goal: Some([1.4, 0.5]),
 };
 
 const BASELINE: Limit = Limit {
-    instructions: "scalar, libm",
     forward: 0.1,
     backward: None,
     goal: None,
@@ -80,15 +77,20 @@ pub struct RasterizeReport {
     pub scene: String,
     /// The work of a view.
     pub work: Work,
-    /// One per number of threads; one of one thread for a device.
+    /// One per number of threads and set of instructions; one of one thread for a device.
     pub rows: Vec<RasterizeRow>,
 }
 
-/// A number of threads.
+/// A number of threads that run the same instructions.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RasterizeRow {
     /// Threads.
     pub threads: usize,
+    /// What the inner loops ran with; absent where a device rendered.
+    pub instructions: Option<String>,
+    /// What they are held against.
+    #[serde(skip)]
+    limit: Option<Limit>,
     /// Passes over the views.
     pub passes: usize,
     /// Tile lists, milliseconds per view. Absent where the rasteriser does not time them apart from the blending.
@@ -158,20 +160,35 @@ pub fn measure(
     )?;
     let facts = describe(device);
     let mut rows = vec![];
-    let threads = match facts {
-        Some(_) => vec![1],
-        None => all_threads(),
+    let runs: Vec<_> = match facts {
+        Some(_) => vec![(1, None)],
+        None => all_threads()
+            .into_iter()
+            .flat_map(|threads| {
+                InstructionSet::available()
+                    .into_iter()
+                    .map(move |set| (threads, Some(set)))
+            })
+            .collect(),
     };
-    for threads in threads {
+    for (threads, set) in runs {
+        let with = set.map_or(String::new(), |set| format!(" with {set}"));
         say(&format!(
-            "rasterising {} views on {threads} thread(s)",
+            "rasterising {} views on {threads} thread(s){with}",
             views.len()
         ));
-        let possible = match facts {
-            Some(_) => None,
-            None => Some(arithmetic::measure(threads)?),
+        let measured = || {
+            let possible = match set {
+                Some(_) => Some(arithmetic::measure(threads)?),
+                None => None,
+            };
+            let passes = on_threads(threads, || passes(data, &views, settings, device, seconds))?;
+            Ok::<_, PerformanceError>((possible, passes))
         };
-        let passes = on_threads(threads, || passes(data, &views, settings, device, seconds))?;
+        let (possible, passes) = match set {
+            Some(set) => set.at_most(measured)?,
+            None => measured()?,
+        };
         let per_view = |pass: &Pass, time: fn(&Pass) -> Duration| {
             1e3 * time(pass).as_secs_f64() / views.len() as f64
         };
@@ -180,6 +197,8 @@ pub fn measure(
         let apart = passes.iter().any(|pass| !pass.lists.is_zero());
         rows.push(RasterizeRow {
             threads,
+            instructions: set.map(|set| set.to_string()),
+            limit: set.map(limit),
             passes: passes.len(),
             lists: apart.then(|| Spread::of(times(|pass| pass.lists))),
             forward: Rate::new(times(|pass| pass.forward), &work, threads),
@@ -401,13 +420,10 @@ impl RasterizeReport {
         if let Some(facts) = &self.device {
             return self.write_device(text, facts);
         }
-        let limit = limit(InstructionSet::chosen());
         writeln!(
             text,
-            "Time per view, and 1e9 pairs per second and thread. The loops ran with {}; goal and share of the limit are those \
-             of {}.{}\n",
-            self.machine.instructions,
-            limit.instructions,
+            "Time per view, and 1e9 pairs per second and thread, with each set of instructions that the processor has; goal and \
+             share of the limit are those of the set.{}\n",
             if self.rows.iter().any(|row| row.lists.is_none()) {
                 " Forward includes making the lists."
             } else {
@@ -416,12 +432,17 @@ impl RasterizeReport {
         )?;
         writeln!(
             text,
-            "| threads | direction | median ms | min | max | tested | blended | goal, tested | share of what is possible here | share \
-             of the limit |"
+            "| threads | instructions | direction | median ms | min | max | tested | blended | goal, tested | share of what is \
+             possible here | share of the limit |"
         )?;
-        writeln!(text, "|--:|---|{}", "--:|".repeat(8))?;
+        writeln!(text, "|--:|---|---|{}", "--:|".repeat(8))?;
         for row in &self.rows {
-            let threads = row.threads;
+            let Some(limit) = row.limit else { continue };
+            let threads = format!(
+                "{} | {}",
+                row.threads,
+                row.instructions.as_deref().unwrap_or_default()
+            );
             if let Some(Spread { median, min, max }) = row.lists {
                 writeln!(
                     text,
@@ -469,15 +490,14 @@ impl RasterizeReport {
         )?;
         for row in &self.rows {
             if let Some(Arithmetic { forward, backward }) = row.possible {
-                let threads = row.threads;
-                let which = if threads == 1 {
-                    "1 thread".to_owned()
-                } else {
-                    format!("each of {threads} threads")
+                let which = match row.threads {
+                    1 => "1 thread".to_owned(),
+                    threads => format!("each of {threads} threads"),
                 };
+                let set = row.instructions.as_deref().unwrap_or_default();
                 writeln!(
                     text,
-                    "- {which}: forward {forward:.2}, backward {backward:.2}"
+                    "- {which}, {set}: forward {forward:.2}, backward {backward:.2}"
                 )?;
             }
         }
