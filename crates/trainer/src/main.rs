@@ -20,5 +20,10 @@ fn main() -> ExitCode {
     // The next step needs what this one frees. Fetching it anew is a tenth of a step of a million Gaussians.
     // SAFETY: no other thread is there yet; the number is an option of the version that the lock file names.
     unsafe { mi_option_set(PURGE_DELAY, -1) };
+    // This thread works too. From outside of the pool each of the dozens of ops of a step would be handed over, and its end
+    // waited for asleep. Fails where there can be no threads at all, which the first op then says.
+    let _ = rayon::ThreadPoolBuilder::new()
+        .use_current_thread()
+        .build_global();
     splat_trainer::cli::main()
 }
