@@ -31,30 +31,29 @@ const PASSES: usize = 30;
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Limit {
     /// What the arithmetic of the inner loop reached on a machine with AVX-512: a tile of 16 x 16 pixels with 256 splats,
-    /// in cache. Not every direction was measured.
-    forward: f64,
-    backward: Option<f64>,
+    /// in cache, forward and backward. Not all of it was measured.
+    reached: [Option<f64>; 2],
     /// What the rasteriser shall reach, forward and backward.
     goal: Option<[f64; 2]>,
 }
 
 const AVX512: Limit = Limit {
-    forward: 3.6,
-    backward: Some(1.2),
+    reached: [Some(3.6), Some(1.2)],
     goal: Some([2.5, 0.8]),
 };
 
 const AVX2: Limit = Limit {
-    forward: 2.0,
-    backward: None,
+    reached: [Some(2.0), None],
     goal: Some([1.4, 0.5]),
 };
 
 const BASELINE: Limit = Limit {
-    forward: 0.1,
-    backward: None,
+    reached: [None; 2],
     goal: None,
 };
+
+/// The same of scalar code with libm, forward.
+const SCALAR: f64 = 0.1;
 
 /// The limit of the instructions that ran. None was measured for NEON, whose vectors are half of AVX2's; it is held
 /// against AVX2.
@@ -455,17 +454,11 @@ impl RasterizeReport {
                 here.map(|here| here.forward),
                 here.map(|here| here.backward),
             ];
-            let directions = [
-                (
-                    "forward",
-                    row.forward,
-                    goals[0],
-                    here[0],
-                    Some(limit.forward),
-                ),
-                ("backward", row.backward, goals[1], here[1], limit.backward),
-            ];
-            for (direction, rate, goal, here, limit) in directions {
+            let directions = [("forward", row.forward), ("backward", row.backward)];
+            let held_against = goals.into_iter().zip(here).zip(limit.reached);
+            for ((direction, rate), ((goal, here), limit)) in
+                directions.into_iter().zip(held_against)
+            {
                 let Spread { median, min, max } = rate.milliseconds;
                 let tested = 1e-9 * rate.tested_per_second;
                 let blended = 1e-9 * rate.blended_per_second;
@@ -501,15 +494,13 @@ impl RasterizeReport {
                 )?;
             }
         }
+        let [avx512, avx2] = [AVX512, AVX2].map(|set| set.reached.map(Option::unwrap_or_default));
         writeln!(
             text,
             "\nThe limit is what the arithmetic alone reached on one core of a machine with AVX-512, on a tile of 16 x 16 \
              pixels with 256 splats in cache: forward {:.1} with AVX-512, {:.1} with AVX2, {:.1} in scalar code with libm; \
              backward {:.1} with AVX-512.",
-            AVX512.forward,
-            AVX2.forward,
-            BASELINE.forward,
-            AVX512.backward.unwrap_or(f64::NAN)
+            avx512[0], avx2[0], SCALAR, avx512[1]
         )
     }
 }
