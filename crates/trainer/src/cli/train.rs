@@ -60,7 +60,7 @@ pub struct TrainArgs {
     /// Density control
     #[arg(long, value_enum, default_value_t)]
     pub strategy: Strategy,
-    /// No growth beyond this many Gaussians [default: one for every two pixels of a photo, or for every hundred
+    /// No growth beyond this many Gaussians [default: seven for every ten pixels of a photo, or one for every hundred
     /// of all photos, whichever is more]
     #[arg(long, value_name = "N")]
     pub max_gaussians: Option<usize>,

@@ -42,8 +42,8 @@ pub struct TrainConfig {
     pub init: InitSettings,
     /// Learning rates.
     pub rates: LearningRates,
-    /// Adaptive density control. Where `max_gaussians` is absent, growth ends at one Gaussian for every two pixels of a
-    /// photo, or for every hundred of all photos that are trained on (300 values for up to 59 parameters), whichever is
+    /// Adaptive density control. Where `max_gaussians` is absent, growth ends at seven Gaussians for every ten pixels of a
+    /// photo, or one for every hundred of all photos that are trained on (300 values for up to 59 parameters), whichever is
     /// more; docs/TRAINING.md has what more would give.
     pub density: AdaptiveSettings,
 }

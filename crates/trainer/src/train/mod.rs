@@ -268,7 +268,7 @@ fn worthwhile_gaussians(capture: &Capture) -> usize {
         view.width as usize * view.height as usize
     };
     let photos = capture.split.train.iter().map(pixels);
-    (photos.clone().sum::<usize>() / 100).max(photos.max().unwrap_or(0) / 2)
+    (photos.clone().sum::<usize>() / 100).max(photos.max().unwrap_or(0) * 7 / 10)
 }
 
 fn first_gaussians(
@@ -665,7 +665,7 @@ mod tests {
             (view.width, view.height) = (40, 30);
         }
         capture.split.train.truncate(2);
-        assert_eq!(most(capture.clone(), config.clone()), Some(600));
+        assert_eq!(most(capture.clone(), config.clone()), Some(840));
         capture.split.train = [0, 1].repeat(50);
         assert_eq!(most(capture.clone(), config.clone()), Some(1_200));
         let mut config = config;
