@@ -20,6 +20,7 @@ pub(crate) mod poison;
 mod project;
 mod rasterize;
 pub(crate) mod real;
+mod schedule;
 mod screen_statistics;
 mod sh_colors;
 mod simd;

@@ -36,6 +36,7 @@ use super::instructions::registers;
 use super::intersect::{CHUNK, Grid, TILE, TileLists};
 use super::parts::{Part, Uncleared};
 use super::real::Real;
+use super::schedule::heaviest_first;
 use super::simd::prefetch;
 use crate::OpError;
 use crate::backend::PROJECTED_WIDTH;
@@ -49,10 +50,6 @@ pub use work::{RasterizeWork, rasterize_work};
 
 /// So many partial gradients before its turn one is fetched.
 const AHEAD: usize = 16;
-
-/// Rows of tiles that a thread takes at once. Of more, which the scheduler would make it take, the last ones are often
-/// worked on alone.
-const ROWS_AT_ONCE: usize = 1;
 
 /// What the forward keeps for the backward: a [`Frame`] per camera, none of an image that was not rendered.
 #[derive(Debug, Clone)]
@@ -183,6 +180,11 @@ impl<'a, T: Real> View<'a, T> {
         }
     }
 
+    /// How many splats the tiles of a row have together.
+    fn work_of_row(&self, ty: usize) -> usize {
+        self.lists.row_of_tiles(ty, self.grid).len()
+    }
+
     /// Columns and rows of a tile that lie in the image.
     fn inside(&self, [tx, ty]: [usize; 2]) -> [usize; 2] {
         [
@@ -280,19 +282,18 @@ fn blend<T: Real>(
     image: Vec<Part<T>>,
 ) -> Frame<T> {
     let view = View::new(&listed, background, args);
-    let traces = image
-        .into_par_iter()
-        .enumerate()
-        .with_max_len(ROWS_AT_ONCE)
-        .map(|(ty, image)| {
+    let traces = heaviest_first(
+        image,
+        |ty| view.work_of_row(ty),
+        |ty, image| {
             let row = RowOfTiles {
                 view: &view,
                 ty,
                 image: image.overwritten(),
             };
             row.run()
-        })
-        .collect();
+        },
+    );
     Frame { listed, traces }
 }
 
@@ -365,13 +366,11 @@ pub(super) fn backward<T: Real>(
         // Every (tile, splat) pair writes its own row; each splat then sums its rows in order.
         let width = MOMENTS + d;
         let mut partials = Uncleared::<T>::new(view.lists.instances() * width);
-        let of_row = |ty: usize| view.lists.row_of_tiles(ty, view.grid).len() * width;
-        let backgrounds: Vec<Vec<T>> = partials
-            .parts((0..view.grid.rows).map(of_row))
-            .into_par_iter()
-            .enumerate()
-            .with_max_len(ROWS_AT_ONCE)
-            .map(|(ty, partials)| {
+        let of_row = |ty: usize| view.work_of_row(ty) * width;
+        let backgrounds = heaviest_first(
+            partials.parts((0..view.grid.rows).map(of_row)),
+            |ty| view.work_of_row(ty),
+            |ty, partials| {
                 let row = RowOfTilesBackward {
                     view: &view,
                     trace: &frame.traces[ty],
@@ -380,8 +379,8 @@ pub(super) fn backward<T: Real>(
                     partials: partials.overwritten(),
                 };
                 row.run()
-            })
-            .collect();
+            },
+        );
         for row in backgrounds {
             for (sum, value) in of_background[index * d..].iter_mut().zip(row) {
                 *sum += value;
@@ -412,8 +411,9 @@ struct RowOfTilesBackward<'a, T> {
 }
 
 impl<T: Real> RowOfTilesBackward<'_, T> {
-    /// In registers of 256 bits at most: it writes a splat's sums, which lie in memory, once for every block, and wider
-    /// registers take twice as long for that as for anything else.
+    /// In registers of 256 bits at most: it writes a splat's sums, which lie in memory, once for every block. Wider
+    /// registers take twice as long for that as for anything else where they are halves to the processor (Zen 4), and
+    /// gain nothing where they are not (Zen 5).
     fn run(self) -> Vec<T> {
         let registers = match registers() {
             #[cfg(target_arch = "x86_64")]
