@@ -8,6 +8,7 @@
 
 mod activation;
 mod adam;
+mod awake;
 mod blur;
 pub(crate) mod buffer;
 mod instructions;
@@ -31,6 +32,7 @@ use burn::backend::flex::FlexTensor;
 use burn::tensor::DType;
 use tracing::trace_span;
 
+pub(crate) use awake::keep_awake;
 pub use instructions::InstructionSet;
 
 pub use rasterize::{RasterizeWork, rasterize_work};

@@ -18,6 +18,7 @@ use burn::module::Module;
 use burn::optim::{GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, Transaction};
 use splat_model::density::{AdaptiveDensity, RunShape};
+use splat_model::ops::device::keep_awake;
 use splat_model::ops::{OpError, SH_DEGREE_MAX};
 use splat_model::{
     EditLog, Gaussians, InitError, project_gaussians, render_projected, scene_origin, scene_scale,
@@ -441,6 +442,7 @@ impl Trainer {
     pub fn step(&mut self) -> Result<(), TrainError> {
         let _span = trace_span!("step").entered();
         let start = Instant::now();
+        keep_awake(&self.device);
         self.update()?;
         let inspects = warnings::course::is_due(self.state.step, self.config.steps);
         if self.unread.len() >= LOSS_BATCH || inspects {

@@ -1,0 +1,76 @@
+//! Threads that wait for the next op without falling asleep.
+
+use core::cell::Cell;
+use core::time::Duration;
+use std::thread;
+use std::time::Instant;
+
+use rayon::Yield;
+
+/// So long a thread looks for work in vain before it sleeps after all. Between the ops of a step it is a tenth of that.
+const PATIENCE: Duration = Duration::from_micros(500);
+
+thread_local! {
+    static LOOKS: Cell<bool> = const { Cell::new(false) };
+}
+
+/// The other threads of the pool look for work from now on, until there was none for a while.
+pub(crate) fn keep_awake() {
+    let own = rayon::current_thread_index();
+    if rayon::current_num_threads() > usize::from(own.is_some()) {
+        rayon::spawn_broadcast(move |thread| {
+            if Some(thread.index()) != own {
+                look_for_work();
+            }
+        });
+    }
+}
+
+fn look_for_work() {
+    // What it finds may be the next request to do so.
+    if LOOKS.replace(true) {
+        return;
+    }
+    let mut found = Instant::now();
+    while found.elapsed() < PATIENCE {
+        match rayon::yield_now() {
+            Some(Yield::Executed) => found = Instant::now(),
+            _ => thread::yield_now(),
+        }
+    }
+    LOOKS.set(false);
+}
+
+#[cfg(test)]
+mod tests {
+    use core::sync::atomic::{AtomicUsize, Ordering::Relaxed};
+
+    use rayon::prelude::*;
+
+    use super::*;
+
+    #[test]
+    fn threads_that_look_for_work_do_it_and_then_rest() {
+        let looking = AtomicUsize::new(0);
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(3).build();
+        let pool = pool.unwrap();
+        let sum: usize = pool.install(|| {
+            // More requests than a stack could hold, were each answered inside of the last one.
+            for _ in 0..100_000 {
+                keep_awake();
+            }
+            (0..1000)
+                .into_par_iter()
+                .map(|i| (0..=i).into_par_iter().map(|j| j % 2).sum::<usize>())
+                .sum()
+        });
+        assert_eq!(sum, (0..1000usize).map(|i| i.div_ceil(2)).sum::<usize>());
+        thread::sleep(10 * PATIENCE);
+        pool.broadcast(|_| {
+            looking.fetch_add(usize::from(LOOKS.get()), Relaxed);
+        });
+        assert_eq!(looking.into_inner(), 0);
+        // From outside of the pool there is no thread that has something else to do.
+        keep_awake();
+    }
+}
