@@ -111,7 +111,8 @@ impl Checker {
     }
 }
 
-fn is_flex(device: &Device) -> bool {
+/// Whether a device, without autodiff, is that of Burn's Flex backend.
+pub(crate) fn is_flex(device: &Device) -> bool {
     #[cfg(feature = "cpu")]
     return matches!(device.as_dispatch(), DispatchDevice::Flex(_));
     #[cfg(not(feature = "cpu"))]

@@ -5,6 +5,7 @@ use burn::tensor::Device;
 #[cfg(feature = "cpu")]
 use burn::tensor::Tensor;
 
+use crate::check::is_flex;
 #[cfg(feature = "cpu")]
 use crate::{OpError, Projected, RasterizeSettings, RasterizeWork};
 
@@ -50,21 +51,15 @@ pub(crate) fn client(device: &Device) -> Option<cubecl::client::Client> {
     }
 }
 
-/// To be called where a training step or the like begins. On the CPU the threads that share the work of an op
-/// otherwise fall asleep behind each, and to wake one takes as long as a small op: on two threads, a twentieth of a step
-/// of 15,000 Gaussians. From here on they look for work instead, until there was none for half a millisecond. Elsewhere
-/// this does nothing.
+/// To be called where a training step or the like begins. On the CPU the threads that share the work of an op, those of the
+/// pool that the caller is in or else of rayon's global one, otherwise fall asleep behind each, and to wake one takes as
+/// long as a small op: on two threads, a twentieth of a step of 15,000 Gaussians. From here on they look for work
+/// instead, until there was none for much longer than a step lies between two ops. Elsewhere this does nothing.
 pub fn keep_awake(device: &Device) {
-    #[cfg(feature = "cpu")]
-    {
-        use burn::backend::DispatchDevice;
-        let device = device.clone().without_autodiff();
-        if matches!(device.as_dispatch(), DispatchDevice::Flex(_)) {
-            crate::cpu::keep_awake();
-        }
+    if is_flex(&device.clone().without_autodiff()) {
+        #[cfg(feature = "cpu")]
+        crate::cpu::keep_awake();
     }
-    #[cfg(not(feature = "cpu"))]
-    let _ = device;
 }
 
 /// What is known of a CubeCL device, and which variant of the kernels runs there: name and value, in an order for

@@ -180,8 +180,8 @@ impl<'a, T: Real> View<'a, T> {
         }
     }
 
-    /// How many splats the tiles of a row have together.
-    fn work_of_row(&self, ty: usize) -> usize {
+    /// How many splats the tiles of a row have together: its length in what is kept per instance, and its work.
+    fn instances_of_row(&self, ty: usize) -> usize {
         self.lists.row_of_tiles(ty, self.grid).len()
     }
 
@@ -284,7 +284,7 @@ fn blend<T: Real>(
     let view = View::new(&listed, background, args);
     let traces = heaviest_first(
         image,
-        |ty| view.work_of_row(ty),
+        |ty| view.instances_of_row(ty),
         |ty, image| {
             let row = RowOfTiles {
                 view: &view,
@@ -318,7 +318,7 @@ impl<T: Real> WithSimd for RowOfTiles<'_, T> {
     fn with_simd<S: Simd>(self) -> Trace<T> {
         let Self { view, ty, image } = self;
         let mut tile = BlendTile::new(view.channels);
-        let splats = view.lists.row_of_tiles(ty, view.grid).len();
+        let splats = view.instances_of_row(ty);
         let mut trace = Trace::with_capacity(view.grid.columns, splats);
         for tx in 0..view.grid.columns {
             tile.blend::<S>(view, [tx, ty], &mut trace, &mut ());
@@ -366,10 +366,10 @@ pub(super) fn backward<T: Real>(
         // Every (tile, splat) pair writes its own row; each splat then sums its rows in order.
         let width = MOMENTS + d;
         let mut partials = Uncleared::<T>::new(view.lists.instances() * width);
-        let of_row = |ty: usize| view.work_of_row(ty) * width;
+        let of_row = |ty: usize| view.instances_of_row(ty) * width;
         let backgrounds = heaviest_first(
             partials.parts((0..view.grid.rows).map(of_row)),
-            |ty| view.work_of_row(ty),
+            |ty| view.instances_of_row(ty),
             |ty, partials| {
                 let row = RowOfTilesBackward {
                     view: &view,
@@ -534,7 +534,7 @@ mod tests {
             let mut later = &mut *partials;
             for (ty, image) in image.chunks_mut(slab).enumerate() {
                 let trace = RowOfTiles { view, ty, image }.with_simd::<S>();
-                let length = view.lists.row_of_tiles(ty, view.grid).len();
+                let length = view.instances_of_row(ty);
                 let (own, rest) = later.split_at_mut(length * (MOMENTS + CHANNELS));
                 later = rest;
                 let row = RowOfTilesBackward {
