@@ -245,13 +245,23 @@ pub fn sh_colors(client: &Client, inputs: &ShInputs, degree: usize) -> Buffer {
     colors
 }
 
-/// The gradient of a colour, without the channels that are clamped.
+/// The gradient of a channel before the clamp: none below zero, unless it `recovers` and descent would raise it.
 #[cube]
-fn passed_on(color: Vec3, g: Vec3) -> Vec3 {
+fn passed_on_channel(color: f32, g: f32, #[comptime] recovers: bool) -> f32 {
+    let mut stops = is_below_zero(color);
+    if comptime!(recovers) {
+        stops = stops && !is_below_zero(g);
+    }
+    select(stops, 0.0f32, g)
+}
+
+/// The gradient of a colour before the clamp.
+#[cube]
+fn passed_on(color: Vec3, g: Vec3, #[comptime] recovers: bool) -> Vec3 {
     Vec3::new(
-        select(is_below_zero(color.x), 0.0f32, g.x),
-        select(is_below_zero(color.y), 0.0f32, g.y),
-        select(is_below_zero(color.z), 0.0f32, g.z),
+        passed_on_channel(color.x, g.x, recovers),
+        passed_on_channel(color.y, g.y, recovers),
+        passed_on_channel(color.z, g.z, recovers),
     )
 }
 
@@ -294,6 +304,7 @@ fn sh_colors_backward_gaussians<R: Float>(
     #[comptime] degree: usize,
     #[comptime] wanted: [bool; 3],
     #[comptime] asked: bool,
+    #[comptime] recovers: bool,
     #[define(R)] _stored_as: ElemType,
 ) {
     let gaussians = gaussians as usize;
@@ -317,7 +328,7 @@ fn sh_colors_backward_gaussians<R: Float>(
                 let sight = sight(means, centers, gaussian, camera);
                 basis(sight.unit, &mut y, degree);
                 let color = unclamped::<R>(sh0, rest, &y, gaussian, stored, degree);
-                let g = passed_on(color, g);
+                let g = passed_on(color, g, recovers);
                 if comptime!(wanted[0] || wanted[1]) {
                     #[unroll]
                     for k in 0..comptime!(functions(degree)) {
@@ -369,6 +380,7 @@ fn sh_colors_backward_centers<R: Float>(
     stored: u32,
     #[comptime] degree: usize,
     #[comptime] asked: bool,
+    #[comptime] recovers: bool,
     #[define(R)] _stored_as: ElemType,
 ) {
     let mut shared = Shared::new_slice(CUBE_UNITS_USIZE);
@@ -391,7 +403,7 @@ fn sh_colors_backward_centers<R: Float>(
                     let mut values = Array::<f32>::new(comptime!(functions(degree)));
                     basis(sight.unit, &mut values, degree);
                     let color = unclamped::<R>(sh0, rest, &values, gaussian, stored, degree);
-                    let g = passed_on(color, g);
+                    let g = passed_on(color, g, recovers);
                     let grad = sight_vjp::<R>(rest, sight, g, gaussian, stored, degree);
                     x -= grad.x;
                     y -= grad.y;
@@ -409,12 +421,13 @@ fn sh_colors_backward_centers<R: Float>(
 }
 
 /// Gradients of sh0 [N, 1, 3], `sh_rest` [N, R, 3], means [N, 3] and centres [C, 3] for that of the colours [C, N, 3];
-/// only those `wanted`.
+/// only those `wanted`. With `recovers`, a channel that is clamped passes on a gradient whose descent raises it.
 pub fn sh_colors_backward(
     client: &Client,
     inputs: &ShInputs,
     grad_colors: &Buffer,
     degree: usize,
+    recovers: bool,
     wanted: [bool; 4],
 ) -> [Option<Buffer>; 4] {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
@@ -447,6 +460,7 @@ pub fn sh_colors_backward(
             degree,
             [wanted[0], wanted[1], wanted[2]],
             asked,
+            recovers,
             stored_as,
         );
     }
@@ -473,6 +487,7 @@ pub fn sh_colors_backward(
                 inputs.stored as u32,
                 degree,
                 asked,
+                recovers,
                 stored_as,
             );
         }

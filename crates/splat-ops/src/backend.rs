@@ -14,7 +14,7 @@ use burn::backend::{Autodiff, Dispatch};
 use crate::activation::Activation;
 use crate::adam::AdamStep;
 use crate::composed;
-use crate::settings::{ProjectArgs, RasterizeArgs};
+use crate::settings::{ProjectArgs, RasterizeArgs, ShColorSettings};
 use crate::ssim::SsimArgs;
 
 /// Floats per splat in the packed output of `project`:
@@ -74,13 +74,13 @@ pub trait SplatBackend: Backend {
 
     /// [`sh_colors`](crate::sh_colors): `[N, 1, 3]`, `[N, R, 3]`, means `[N, 3]` and centres `[C, 3]` to `[C, N, 3]`. There
     /// are higher coefficients exactly when the degree is above 0.
-    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> FloatTensor<Self>;
+    fn sh_colors_forward(inputs: ShInputs<Self>, settings: ShColorSettings) -> FloatTensor<Self>;
 
     /// Gradients of the four inputs, given the gradient `[C, N, 3]` of the colours.
     fn sh_colors_backward(
         inputs: ShInputs<Self>,
         grad: FloatTensor<Self>,
-        degree: usize,
+        settings: ShColorSettings,
         wanted: [bool; 4],
     ) -> [Option<FloatTensor<Self>>; 4];
 
@@ -270,7 +270,7 @@ pub(crate) trait SplatOps: Backend {
         means: FloatTensor<Self>,
         centers: FloatTensor<Self>,
         #[extension_type] seen: Optional<Self>,
-        degree: usize,
+        settings: ShColorSettings,
     ) -> FloatTensor<Self>;
 
     fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self>;
@@ -341,7 +341,7 @@ macro_rules! forward_only {
                 means: FloatTensor<Self>,
                 centers: FloatTensor<Self>,
                 seen: Optional<Self>,
-                degree: usize,
+                settings: ShColorSettings,
             ) -> FloatTensor<Self> {
                 let inputs = ShInputs {
                     sh0,
@@ -350,7 +350,7 @@ macro_rules! forward_only {
                     centers,
                     seen: seen.into_option(),
                 };
-                Self::sh_colors_forward(inputs, degree)
+                Self::sh_colors_forward(inputs, settings)
             }
 
             fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self> {

@@ -6,6 +6,7 @@ use burn::tensor::Device;
 use burn::tensor::Tensor;
 
 use crate::check::is_flex;
+pub use crate::memory::available_memory;
 #[cfg(feature = "cpu")]
 use crate::{OpError, Projected, RasterizeSettings, RasterizeWork};
 

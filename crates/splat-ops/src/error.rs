@@ -52,6 +52,21 @@ pub enum OpError {
         /// How many of them can be listed.
         limit: u64,
     },
+    /// The lists of splats by tile need more memory than this process can get.
+    #[error(
+        "{op}: {pairs} pairs of a tile and a splat that touches it need {needed} of memory, and {left} are left. \
+         Render a smaller image, fewer cameras per call, or remove Gaussians: huge ones first"
+    )]
+    OutOfMemory {
+        /// The op.
+        op: &'static str,
+        /// Pairs of a tile and a splat that touches it.
+        pairs: u64,
+        /// What they need, in words.
+        needed: String,
+        /// What is left, in words.
+        left: String,
+    },
     /// A kernel needs more buffers than the device lets it have.
     #[error(
         "{op}: this device lets a kernel bind {bound} storage buffers (wgpu's limit \

@@ -89,6 +89,7 @@ pub fn rasterize<const DC: usize, const DO: usize>(
         RasterizeArgs {
             size: projected.image_size(),
             settings: *settings,
+            backward: false,
             errors: errors.clone(),
         },
     );

@@ -73,6 +73,35 @@ impl Default for RasterizeSettings {
     }
 }
 
+/// Gradient of the clamp of colours at zero, `max(x, 0)`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum ClampGradient {
+    /// The derivative: nothing passes below zero.
+    #[default]
+    Exact,
+    /// The derivative, and below zero also a gradient whose descent raises the channel. A channel that has slipped
+    /// below zero in every view would otherwise stay black for good, since nothing could ever reach it. For training.
+    Recovering,
+}
+
+/// Settings of [`sh_colors`](crate::sh_colors). A degree alone becomes settings by [`From`], with the exact gradient.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub struct ShColorSettings {
+    /// Degree of the spherical harmonics, 0 to 3. Default 0.
+    pub degree: usize,
+    /// Gradient of the clamp at zero. Default exact.
+    pub clamp_gradient: ClampGradient,
+}
+
+impl From<usize> for ShColorSettings {
+    fn from(degree: usize) -> Self {
+        Self {
+            degree,
+            ..Self::default()
+        }
+    }
+}
+
 /// Everything but tensors that a backend needs to project.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ProjectArgs {
@@ -89,6 +118,8 @@ pub struct RasterizeArgs {
     pub size: ImageSize,
     /// Settings.
     pub settings: RasterizeSettings,
+    /// Whether a backward pass follows: then there must be memory for it too.
+    pub backward: bool,
     /// For what goes wrong on the way.
     pub errors: ErrorSlot,
 }

@@ -6,7 +6,7 @@ use burn::tensor::{DType, Tensor};
 use crate::backend::{Optional, PROJECTED_WIDTH, SplatOps};
 use crate::check::Checker;
 use crate::device::reads_half;
-use crate::{OpError, Projected, SH_DEGREE_MAX, sh_coefficient_count};
+use crate::{OpError, Projected, SH_DEGREE_MAX, ShColorSettings, sh_coefficient_count};
 
 /// Colours `[C, N, 3]` of N Gaussians in C cameras: `max(SH(mean - centre) + 0.5, 0)`, SH being
 /// [`spherical_harmonics`](crate::spherical_harmonics) of the coefficients `[sh0, sh_rest]`.
@@ -21,11 +21,12 @@ use crate::{OpError, Projected, SH_DEGREE_MAX, sh_coefficient_count};
 ///   all sums as ever.
 /// - `means` `[N, 3]`: world space.
 /// - `centers` `[C, 3]`: where the cameras stand.
-/// - `degree`: 0 to 3.
+/// - `settings`: the degree, 0 to 3, and the gradient of the clamp; a degree alone will do.
 /// - `seen`: the same Gaussians projected by the same cameras. Those that are culled there (no extent) are black and pass no
 ///   gradient on; their coefficients are not read. Without it all colours are computed.
 ///
-/// A channel that is clamped at zero passes no gradient on; one that is exactly zero does.
+/// A channel that is clamped at zero passes no gradient on, unless
+/// [`ClampGradient::Recovering`](crate::ClampGradient::Recovering) is asked for; one that is exactly zero does.
 ///
 /// # Errors
 /// When the degree is above 3, or shapes, types or devices do not fit.
@@ -34,9 +35,11 @@ pub fn sh_colors(
     sh_rest: Option<Tensor<3>>,
     means: Tensor<2>,
     centers: Tensor<2>,
-    degree: usize,
+    settings: impl Into<ShColorSettings>,
     seen: Option<&Projected>,
 ) -> Result<Tensor<3>, OpError> {
+    let settings = settings.into();
+    let degree = settings.degree;
     let check = Checker::new("sh_colors", "sh0", &sh0)?;
     let [n, _, _] = sh0.dims();
     check.tensor("sh0", &sh0, [None, Some(1), Some(3)], "[N, 1, 3]")?;
@@ -81,7 +84,7 @@ pub fn sh_colors(
         means.into_dispatch(),
         centers.into_dispatch(),
         seen,
-        degree,
+        settings,
     );
     Ok(Tensor::from_dispatch(colors))
 }

@@ -29,7 +29,7 @@ fn bits(client: &Client, inputs: &ShInputs, grad: &Buffer, degree: usize) -> Vec
         values.iter().map(|value| value.to_bits()).collect()
     };
     let wanted = [true, false, true, true];
-    let grads = sh_colors_backward(client, inputs, grad, degree, wanted);
+    let grads = sh_colors_backward(client, inputs, grad, degree, false, wanted);
     let mut found = vec![read(&sh_colors(client, inputs, degree))];
     found.extend(grads.iter().flatten().map(read));
     assert_eq!(found.len(), 4);

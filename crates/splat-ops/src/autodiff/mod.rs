@@ -20,7 +20,7 @@ use burn::backend::{Autodiff, AutodiffBackend, tensor::FloatTensor};
 use crate::activation::Activation;
 use crate::adam::AdamStep;
 use crate::backend::{AdamTensors, Optional, SplatBackend, SplatOps, StatisticsTensors, Target};
-use crate::settings::{ProjectArgs, RasterizeArgs};
+use crate::settings::{ProjectArgs, RasterizeArgs, ShColorSettings};
 use crate::ssim::SsimArgs;
 
 impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
@@ -49,10 +49,10 @@ impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
         means: FloatTensor<Self>,
         centers: FloatTensor<Self>,
         seen: Optional<Self>,
-        degree: usize,
+        settings: ShColorSettings,
     ) -> FloatTensor<Self> {
         let (sh_rest, seen) = (sh_rest.into_option(), seen.into_option());
-        sh_colors::sh_colors::<B, C>(sh0, sh_rest, means, centers, seen, degree)
+        sh_colors::sh_colors::<B, C>(sh0, sh_rest, means, centers, seen, settings)
     }
 
     fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self> {

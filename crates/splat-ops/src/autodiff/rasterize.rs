@@ -97,7 +97,7 @@ fn record<B: SplatBackend, C: CheckpointStrategy, const N: usize>(
     prep: OpsKind<RasterizeBackward, B, State<B>, C, N>,
     inputs: [FloatTensor<Autodiff<B, C>>; 3],
     background: Option<FloatTensor<Autodiff<B, C>>>,
-    args: RasterizeArgs,
+    mut args: RasterizeArgs,
 ) -> FloatTensor<Autodiff<B, C>>
 where
     RasterizeBackward: Backward<B, N, State = State<B>>,
@@ -105,6 +105,7 @@ where
     let inputs = inputs.map(|input| input.into_primitive());
     let background = background.map(|background| background.into_primitive());
     let [packed, colors, opacities] = inputs.clone();
+    args.backward = matches!(prep, OpsKind::Tracked(_));
     let (output, lists) =
         B::rasterize_forward(packed, colors, opacities, background.clone(), &args);
     match prep {

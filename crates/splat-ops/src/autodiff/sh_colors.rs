@@ -7,33 +7,34 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
 use super::register;
+use crate::ShColorSettings;
 use crate::backend::{ShInputs, SplatBackend};
 
 #[derive(Debug)]
 struct ShColorsBackward;
 
 impl<B: SplatBackend> Backward<B, 1> for ShColorsBackward {
-    type State = (ShInputs<B>, usize);
+    type State = (ShInputs<B>, ShColorSettings);
 
     fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
-        let (inputs, degree) = ops.state;
+        let (inputs, settings) = ops.state;
         let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
         let wanted = [parents[0].is_some(), false, false, false];
-        let [sh0, ..] = B::sh_colors_backward(inputs, grad, degree, wanted);
+        let [sh0, ..] = B::sh_colors_backward(inputs, grad, settings, wanted);
         register::<B, 1>(grads, parents, [sh0]);
     }
 }
 
 impl<B: SplatBackend> Backward<B, 4> for ShColorsBackward {
-    type State = (ShInputs<B>, usize);
+    type State = (ShInputs<B>, ShColorSettings);
 
     fn backward(self, ops: Ops<Self::State, 4>, grads: &mut Gradients, _: &mut Checkpointer) {
         let grad = grads.consume::<B>(&ops.node);
-        let (inputs, degree) = ops.state;
+        let (inputs, settings) = ops.state;
         let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
         let wanted = parents.map(|parent| parent.is_some());
-        let values = B::sh_colors_backward(inputs, grad, degree, wanted);
+        let values = B::sh_colors_backward(inputs, grad, settings, wanted);
         register::<B, 4>(grads, parents, values);
     }
 }
@@ -44,7 +45,7 @@ pub(super) fn sh_colors<B: SplatBackend, C: CheckpointStrategy>(
     means: FloatTensor<Autodiff<B, C>>,
     centers: FloatTensor<Autodiff<B, C>>,
     seen: Option<FloatTensor<Autodiff<B, C>>>,
-    degree: usize,
+    settings: ShColorSettings,
 ) -> FloatTensor<Autodiff<B, C>> {
     let inputs = |sh_rest| ShInputs {
         sh0: sh0.clone().into_primitive(),
@@ -58,28 +59,28 @@ pub(super) fn sh_colors<B: SplatBackend, C: CheckpointStrategy>(
             let nodes = [&sh0, &rest, &means, &centers].map(|input| input.node());
             let prep = ShColorsBackward.prepare::<C>(nodes);
             let inputs = inputs(Some(rest.into_primitive()));
-            record::<B, C, 4>(prep.compute_bound().stateful(), inputs, degree)
+            record::<B, C, 4>(prep.compute_bound().stateful(), inputs, settings)
         }
         None => {
             let prep = ShColorsBackward.prepare::<C>([sh0.node()]);
-            record::<B, C, 1>(prep.compute_bound().stateful(), inputs(None), degree)
+            record::<B, C, 1>(prep.compute_bound().stateful(), inputs(None), settings)
         }
     }
 }
 
 fn record<B: SplatBackend, C: CheckpointStrategy, const N: usize>(
-    prep: OpsKind<ShColorsBackward, B, (ShInputs<B>, usize), C, N>,
+    prep: OpsKind<ShColorsBackward, B, (ShInputs<B>, ShColorSettings), C, N>,
     inputs: ShInputs<B>,
-    degree: usize,
+    settings: ShColorSettings,
 ) -> FloatTensor<Autodiff<B, C>>
 where
-    ShColorsBackward: Backward<B, N, State = (ShInputs<B>, usize)>,
+    ShColorsBackward: Backward<B, N, State = (ShInputs<B>, ShColorSettings)>,
 {
     match prep {
         OpsKind::Tracked(prep) => {
-            let colors = B::sh_colors_forward(inputs.clone(), degree);
-            prep.finish((inputs, degree), colors)
+            let colors = B::sh_colors_forward(inputs.clone(), settings);
+            prep.finish((inputs, settings), colors)
         }
-        OpsKind::UnTracked(prep) => prep.finish(B::sh_colors_forward(inputs, degree)),
+        OpsKind::UnTracked(prep) => prep.finish(B::sh_colors_forward(inputs, settings)),
     }
 }

@@ -13,10 +13,11 @@ use rayon::prelude::*;
 
 use super::buffer::overwritten;
 use super::parts::{Part, Uncleared};
-use super::rasterize::Splat;
+use super::rasterize::{MOMENTS, Splat, kept_per_pair};
 use super::real::Real;
 use crate::OpError;
 use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH};
+use crate::memory::{in_units, lacking};
 use crate::settings::RasterizeArgs;
 use emit::{Emission, Emitted, emit};
 
@@ -45,6 +46,35 @@ fn check_pairs(pairs: u64, limit: u64) -> Result<(), OpError> {
         pairs,
         limit,
     })
+}
+
+/// Refuses pairs that memory could not hold: the allocation that failed would end the process.
+fn check_memory(pairs: u64, bytes_per_pair: u64) -> Result<(), OpError> {
+    let needed = pairs.saturating_mul(bytes_per_pair);
+    match lacking(needed) {
+        None => Ok(()),
+        Some(left) => Err(OpError::OutOfMemory {
+            op: "rasterize",
+            pairs,
+            needed: in_units(needed),
+            left: in_units(left),
+        }),
+    }
+}
+
+/// Bytes that a pair takes at most at any one time: while the lists are made, or then with what the forward pass keeps of
+/// it and, where a backward pass follows, with its partial gradients.
+fn bytes_per_pair<T: Real>(channels: usize, args: &RasterizeArgs) -> u64 {
+    let number = size_of::<T>();
+    // Tiles of the emission, whose vectors grow by doubling; owners, instances, splats and places.
+    let while_listed = (2 + 4) * size_of::<u32>();
+    let listed = 2 * size_of::<u32>();
+    let partials = if args.backward {
+        (MOMENTS + channels) * number
+    } else {
+        0
+    };
+    while_listed.max(listed + kept_per_pair(number) + partials) as u64
 }
 
 #[cfg(not(test))]
@@ -148,10 +178,14 @@ impl TileLists {
                 })
                 .collect()
         };
-        // Where there may be too many they are counted before any is kept: memory might not hold so many.
+        // Where there may be too many they are counted before any is kept.
         let limit = max_pairs();
-        if listed.len() as u64 * grid.tiles() as u64 > limit {
-            check_pairs(emitted(false).iter().map(|part| part.pairs).sum(), limit)?;
+        let each = bytes_per_pair::<T>(colors.len() / count.max(1), args);
+        let most = listed.len() as u64 * grid.tiles() as u64;
+        if most > limit || lacking(most.saturating_mul(each)).is_some() {
+            let pairs = emitted(false).iter().map(|part| part.pairs).sum();
+            check_pairs(pairs, limit)?;
+            check_memory(pairs, each)?;
         }
         let emitted = emitted(true);
 
@@ -374,6 +408,7 @@ mod tests {
                 height: 2,
             },
             settings: Default::default(),
+            backward: false,
             errors: Default::default(),
         }
     }

@@ -41,7 +41,7 @@ use crate::activation::Activation;
 use crate::adam::AdamStep;
 use crate::backend::{ShInputs, SplatBackend, Target};
 use crate::composed;
-use crate::settings::{ProjectArgs, RasterizeArgs};
+use crate::settings::{ProjectArgs, RasterizeArgs, ShColorSettings};
 use crate::ssim::SsimArgs;
 
 /// Runs a generic function in the precision of a tensor. The public ops let only F32 and F64 pass.
@@ -123,19 +123,19 @@ impl SplatBackend for Flex {
         )
     }
 
-    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> FlexTensor {
+    fn sh_colors_forward(inputs: ShInputs<Self>, settings: ShColorSettings) -> FlexTensor {
         let _span = trace_span!("colours").entered();
-        in_precision!(inputs.means, sh_colors::forward, inputs, degree)
+        in_precision!(inputs.means, sh_colors::forward, inputs, settings)
     }
 
     fn sh_colors_backward(
         inputs: ShInputs<Self>,
         grad: FlexTensor,
-        degree: usize,
+        settings: ShColorSettings,
         wanted: [bool; 4],
     ) -> [Option<FlexTensor>; 4] {
         let _span = trace_span!("colours gradient").entered();
-        in_precision!(grad, sh_colors::backward, inputs, grad, degree, wanted)
+        in_precision!(grad, sh_colors::backward, inputs, grad, settings, wanted)
     }
 
     fn activate(x: FlexTensor, function: Activation) -> FlexTensor {

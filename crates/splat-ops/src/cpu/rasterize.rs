@@ -43,9 +43,11 @@ use crate::backend::PROJECTED_WIDTH;
 use crate::settings::RasterizeArgs;
 use batch::by_groups;
 use blend::BlendTile;
-use gradient::{GradientTile, MOMENTS};
+use gradient::GradientTile;
+pub(super) use gradient::MOMENTS;
 pub(super) use splat::{GROUP, NUMBERS, Splat};
 use trace::Trace;
+pub(super) use trace::kept_per_pair;
 pub use work::{RasterizeWork, rasterize_work};
 
 /// So many partial gradients before its turn one is fetched.
@@ -583,6 +585,7 @@ mod tests {
         let args = RasterizeArgs {
             size,
             settings: Default::default(),
+            backward: true,
             errors: ErrorSlot::default(),
         };
         let camera = Camera {

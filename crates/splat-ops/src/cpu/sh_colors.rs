@@ -19,6 +19,7 @@ use super::spherical_harmonics::{
     COUNT_MAX, basis, basis_gradient, guarded_dot, is_zero, normalize,
 };
 use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH, ShInputs};
+use crate::settings::{ClampGradient, ShColorSettings};
 use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
 
 /// Gaussians per unit of parallel work. Fixed, so that sums over Gaussians have a fixed order.
@@ -44,7 +45,7 @@ impl Tensors {
         }
     }
 
-    fn slices<T: Real>(&self, degree: usize) -> Inputs<'_, T> {
+    fn slices<T: Real>(&self, settings: ShColorSettings) -> Inputs<'_, T> {
         Inputs {
             sh0: self.sh0.slice(),
             rest: self.sh_rest.as_ref().map_or(&[], |rest| rest.slice()),
@@ -52,7 +53,8 @@ impl Tensors {
             means: self.means.slice(),
             centers: self.centers.slice(),
             seen: self.seen.as_ref().map(Buffer::slice),
-            degree,
+            degree: settings.degree,
+            recovers: settings.clamp_gradient == ClampGradient::Recovering,
         }
     }
 }
@@ -68,6 +70,8 @@ struct Inputs<'a, T> {
     /// Packed splats.
     seen: Option<&'a [T]>,
     degree: usize,
+    /// See [`ClampGradient::Recovering`].
+    recovers: bool,
 }
 
 impl<'a, T: Real> Inputs<'a, T> {
@@ -274,10 +278,10 @@ fn evaluate_degree_backward<T: Real, const DEGREE: usize>(
 pub(super) fn forward<T: Real>(
     _: PhantomData<T>,
     inputs: ShInputs<Flex>,
-    degree: usize,
+    settings: ShColorSettings,
 ) -> FlexTensor {
     let tensors = Tensors::new(inputs);
-    let inputs = tensors.slices::<T>(degree);
+    let inputs = tensors.slices::<T>(settings);
     let (c, n) = (inputs.centers.len() / 3, inputs.count());
     let mut colors = Uncleared::<T>::new(c * n * 3);
     let parts = colors.chunks_of_each(c, 3 * CHUNK);
@@ -288,7 +292,7 @@ pub(super) fn forward<T: Real>(
             let directions = inputs.directions(rows.iter().copied(), center);
             let mut units = [[T::ZERO; LANES]; 4];
             let mut basis = [[T::ZERO; LANES]; COUNT_MAX];
-            evaluate(degree, &directions, &mut units, &mut basis);
+            evaluate(inputs.degree, &directions, &mut units, &mut basis);
             colors_of_rows(&inputs, rows, first, &basis, colors);
         });
     });
@@ -382,7 +386,7 @@ fn add_to_degree<T: Real, const REST: usize>(
     for (lane, (n, color)) in rows.iter().zip(colors).enumerate() {
         let mut grad = [grad[3 * n], grad[3 * n + 1], grad[3 * n + 2]];
         for (grad, color) in grad.iter_mut().zip(color) {
-            if color < T::ZERO {
+            if color < T::ZERO && !(inputs.recovers && *grad < T::ZERO) {
                 *grad = T::ZERO;
             }
         }
@@ -445,11 +449,11 @@ pub(super) fn backward<T: Real>(
     _: PhantomData<T>,
     inputs: ShInputs<Flex>,
     grad: FlexTensor,
-    degree: usize,
+    settings: ShColorSettings,
     wanted: [bool; 4],
 ) -> [Option<FlexTensor>; 4] {
     let tensors = Tensors::new(inputs);
-    let inputs = tensors.slices::<T>(degree);
+    let inputs = tensors.slices::<T>(settings);
     let grad = Buffer::new(grad);
     let grad = grad.slice::<T>();
     let (c, n) = (inputs.centers.len() / 3, inputs.count());

@@ -32,7 +32,7 @@ use crate::activation::Activation;
 use crate::adam::AdamStep;
 use crate::backend::{ShInputs, SplatBackend, Target};
 use crate::composed;
-use crate::settings::{ProjectArgs, RasterizeArgs};
+use crate::settings::{ProjectArgs, RasterizeArgs, ShColorSettings};
 use crate::ssim::SsimArgs;
 
 /// A tensor of f32, contiguous.
@@ -138,19 +138,19 @@ impl SplatBackend for CubeBackend {
         spherical_harmonics::backward(coeffs, dirs, grad, degree, wanted)
     }
 
-    fn sh_colors_forward(inputs: ShInputs<Self>, degree: usize) -> CubeTensor {
+    fn sh_colors_forward(inputs: ShInputs<Self>, settings: ShColorSettings) -> CubeTensor {
         let _span = trace_span!("colours").entered();
-        sh_colors::forward(inputs, degree)
+        sh_colors::forward(inputs, settings)
     }
 
     fn sh_colors_backward(
         inputs: ShInputs<Self>,
         grad: CubeTensor,
-        degree: usize,
+        settings: ShColorSettings,
         wanted: [bool; 4],
     ) -> [Option<CubeTensor>; 4] {
         let _span = trace_span!("colours gradient").entered();
-        sh_colors::backward(inputs, grad, degree, wanted)
+        sh_colors::backward(inputs, grad, settings, wanted)
     }
 
     fn activate(x: CubeTensor, function: Activation) -> CubeTensor {

@@ -10,6 +10,7 @@ use splat_kernels::sh_colors as kernels;
 
 use super::{buffer, prepare, tensor};
 use crate::backend::ShInputs;
+use crate::settings::{ClampGradient, ShColorSettings};
 
 /// The inputs, ready for the kernels.
 struct Prepared {
@@ -54,10 +55,10 @@ impl Prepared {
 }
 
 /// Colours `[C, N, 3]`.
-pub(super) fn forward(inputs: ShInputs<CubeBackend>, degree: usize) -> CubeTensor {
+pub(super) fn forward(inputs: ShInputs<CubeBackend>, settings: ShColorSettings) -> CubeTensor {
     let inputs = Prepared::new(inputs);
     let (means, centers) = (&inputs.means, &inputs.centers);
-    let colors = kernels::sh_colors(&means.client, &inputs.buffers(), degree);
+    let colors = kernels::sh_colors(&means.client, &inputs.buffers(), settings.degree);
     let shape = [centers.shape()[0], means.shape()[0], 3];
     tensor(means, colors, Shape::from(shape))
 }
@@ -66,7 +67,7 @@ pub(super) fn forward(inputs: ShInputs<CubeBackend>, degree: usize) -> CubeTenso
 pub(super) fn backward(
     inputs: ShInputs<CubeBackend>,
     grad: CubeTensor,
-    degree: usize,
+    settings: ShColorSettings,
     wanted: [bool; 4],
 ) -> [Option<CubeTensor>; 4] {
     let inputs = Prepared::new(inputs);
@@ -75,7 +76,8 @@ pub(super) fn backward(
         &grad.client,
         &inputs.buffers(),
         &buffer(&grad),
-        degree,
+        settings.degree,
+        settings.clamp_gradient == ClampGradient::Recovering,
         wanted,
     );
     let like = |grad: Option<_>, input: &CubeTensor| Some(tensor(input, grad?, input.shape()));

@@ -6,7 +6,10 @@ use rand_pcg::Pcg32;
 
 use super::devices;
 use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH};
-use crate::{ImageSize, Projected, sh_coefficient_count, sh_colors, spherical_harmonics};
+use crate::{
+    ClampGradient, ImageSize, Projected, ShColorSettings, sh_coefficient_count, sh_colors,
+    spherical_harmonics,
+};
 
 /// Inputs as leaves: sh0, sh_rest, means, centres.
 struct Leaves {
@@ -192,6 +195,41 @@ fn what_a_camera_culled_is_black_and_gets_no_gradient() {
                 assert!(found.1.iter().any(|x| *x != 0.0), "{name}: {part}");
             }
         }
+    }
+}
+
+/// Below zero the exact gradient stops; the recovering one passes on what descent would raise the channel by. Of what is
+/// not clamped both are the same.
+#[test]
+fn a_channel_below_zero_can_recover_if_asked_to() {
+    const Y0: f32 = 0.282_094_8;
+    let below = -2.0f32;
+    for (name, device) in devices() {
+        let device = device.autodiff();
+        let tensor = |values: [f32; 6], shape: [usize; 3]| {
+            Tensor::<3>::from_data(TensorData::new(values.to_vec(), shape), &device)
+        };
+        let slopes = |clamp_gradient: ClampGradient| -> Vec<f32> {
+            let sh0 = tensor([below, below, 1.0, below, 1.0, below], [2, 1, 3]).require_grad();
+            let upstream = tensor([0.5, -0.5, 0.5, -0.25, -0.5, 0.0], [1, 2, 3]);
+            let [means, centers] = [2, 1].map(|rows| Tensor::<2>::ones([rows, 3], &device));
+            let settings = ShColorSettings {
+                degree: 0,
+                clamp_gradient,
+            };
+            let colors = sh_colors(sh0.clone(), None, means, centers, settings, None).unwrap();
+            let grads = (colors * upstream).sum().backward();
+            let slopes = sh0.grad(&grads).unwrap().into_data();
+            let slopes = slopes.try_into_vec::<f32>().unwrap();
+            slopes
+                .iter()
+                .map(|slope| (slope / Y0 * 1e4).round() / 1e4)
+                .collect()
+        };
+        let exact = slopes(ClampGradient::Exact);
+        assert_eq!(exact, [0.0, 0.0, 0.5, 0.0, -0.5, 0.0], "{name}");
+        let recovering = slopes(ClampGradient::Recovering);
+        assert_eq!(recovering, [0.0, -0.5, 0.5, -0.25, -0.5, 0.0], "{name}");
     }
 }
 

@@ -248,6 +248,7 @@ mod tests {
                 height: SIZE[1] as u32,
             },
             settings: Default::default(),
+            backward: false,
             errors: Default::default(),
         };
         let grid = Grid::new(&args);

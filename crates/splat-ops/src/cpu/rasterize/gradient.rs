@@ -36,7 +36,7 @@ use super::splat::{
 use super::trace::{ByBlock, TileTrace};
 
 /// Sums per splat before those of its D colours.
-pub(super) const MOMENTS: usize = 6;
+pub(in super::super) const MOMENTS: usize = 6;
 
 /// The pixels of a tile while they are walked back to front, by block.
 pub(super) struct GradientTile<S: Simd, T: Real> {

@@ -2,10 +2,17 @@
 
 use core::ops::Range;
 
+use super::super::intersect::TILE;
+use super::batch::BATCH;
 use super::splat::{Aligned, BLOCKS, Lanes};
 
 /// One value per pixel of a tile, by block.
 pub(super) type ByBlock<T> = [Aligned<Lanes<T>>; BLOCKS];
+
+/// Bytes that is kept of each pair of a tile and a splat, at most, with numbers of this size.
+pub(in super::super) const fn kept_per_pair(number: usize) -> usize {
+    size_of::<u16>() + number * (TILE * TILE).div_ceil(BATCH)
+}
 
 /// Of the tiles of a row, one after the other.
 pub(super) struct Trace<T> {

@@ -51,6 +51,7 @@ pub fn rasterize_work<const DC: usize, const DO: usize>(
     let args = RasterizeArgs {
         size: projected.image_size(),
         settings: *settings,
+        backward: false,
         errors: ErrorSlot::default(),
     };
     let mut work = RasterizeWork::default();
