@@ -68,7 +68,8 @@ pub enum SceneFileError {
         /// What is wrong with it.
         reason: String,
     },
-    /// A value that is NaN or infinite.
+    /// A value that is NaN, or infinite where that means nothing: opacity logits may be infinite, log-scales minus
+    /// infinite.
     #[error("{}: Gaussian {index}: {property} is {value}", path.display())]
     NotFinite {
         /// The file.

@@ -38,7 +38,7 @@ const ORIGIN: &str = "origin";
 /// # Errors
 ///
 /// [`SceneFileError::Shape`] where the arrays of the scene do not fit each other, [`SceneFileError::NotFinite`] where a
-/// value is NaN or infinite (no reader would take the file), [`SceneFileError::Io`] where the file cannot be written.
+/// value is NaN, or infinite where that means nothing (no reader would take the file), [`SceneFileError::Io`] where the file cannot be written.
 pub fn write(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
     scene.check_shape()?;
     let names = property_names(scene.sh_rest_len());
@@ -75,7 +75,8 @@ pub fn write(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
     let mut row = Row::new();
     for index in 0..scene.len() {
         row.fill(scene, index);
-        if let Some(at) = row.values.iter().position(|value| !value.is_finite()) {
+        let bad = |(at, value): (usize, &f32)| !value.is_finite() && !may_be(&names[at], *value);
+        if let Some(at) = row.values.iter().enumerate().position(bad) {
             return Err(SceneFileError::NotFinite {
                 path: path.to_path_buf(),
                 index,
@@ -179,6 +180,16 @@ fn origin(path: &Path, header: &Header) -> Result<[f64; 3], SceneFileError> {
         };
     }
     Ok(origin)
+}
+
+/// Whether a property may have this value. Infinity is one where it means something: opacity logits of plus and minus
+/// infinity are opacities of 1 and 0, and a log-scale of minus infinity is a flat Gaussian.
+fn may_be(property: &str, value: f32) -> bool {
+    match property {
+        "opacity" => !value.is_nan(),
+        _ if property.starts_with("scale_") => value < f32::INFINITY,
+        _ => value.is_finite(),
+    }
 }
 
 /// Names of the properties in the order they are written, for a scene of `rest` values `f_rest_*`.
@@ -435,12 +446,17 @@ impl Columns {
         }
     }
 
-    /// Appends the row's Gaussian to `scene`; or returns the first column, in the order of the fields, whose value is
-    /// not finite.
+    /// Appends the row's Gaussian to `scene`; or returns the first column, in the order of the fields, whose value means
+    /// nothing (see [`may_be`]).
     fn take(&self, row: &Row, scene: &mut SplatData) -> Result<(), usize> {
         let value = |column: usize| {
             let value = row.values[column];
-            if value.is_finite() {
+            let property = || match column {
+                _ if column == self.opacity => "opacity",
+                _ if self.scales.contains(&column) => "scale_",
+                _ => "",
+            };
+            if value.is_finite() || may_be(property(), value) {
                 Ok(value)
             } else {
                 Err(column)

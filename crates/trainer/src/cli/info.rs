@@ -48,9 +48,29 @@ fn bounds(positions: impl Iterator<Item = [f64; 3]>) -> [[f64; 2]; 3] {
     )
 }
 
-/// Bounds as three lines, each axis on its own.
+/// Bounds as three lines, each axis on its own, with digits enough for an extent in any unit.
 fn bounds_text(bounds: [[f64; 2]; 3]) -> String {
-    let line =
-        |(axis, [least, most]): (&str, [f64; 2])| format!("  {axis}  {least:.4} to {most:.4}\n");
+    let line = |(axis, [least, most]): (&str, [f64; 2])| {
+        let extent = most - least;
+        let digits = match extent.log10().floor() {
+            magnitude if magnitude.is_finite() => 4 + (-magnitude).clamp(0.0, 20.0) as usize,
+            _ => 4,
+        };
+        format!("  {axis}  {least:.digits$} to {most:.digits$}\n")
+    };
     ["x", "y", "z"].into_iter().zip(bounds).map(line).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::bounds_text;
+
+    #[test]
+    fn bounds_can_be_read_in_any_unit() {
+        let text = bounds_text([[-1.0, 1.5], [2e-6, 5e-6], [3.0, 3.0]]);
+        assert_eq!(
+            text,
+            "  x  -1.0000 to 1.5000\n  y  0.0000020000 to 0.0000050000\n  z  3.0000 to 3.0000\n"
+        );
+    }
 }

@@ -220,6 +220,41 @@ fn values_that_are_not_finite_are_named() {
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
 }
 
+/// Opacities of 1 and 0, and flat Gaussians.
+#[test]
+fn infinities_that_mean_something_are_values() {
+    let folder = TempDir::new().unwrap();
+    let path = file_in(&folder);
+    let mut infinite = scene(3, 1);
+    infinite.opacity_logits = vec![f32::INFINITY, f32::NEG_INFINITY, 0.0];
+    infinite.log_scales[1] = [f32::NEG_INFINITY, 0.5, f32::NEG_INFINITY];
+    write(&path, &infinite).unwrap();
+    assert_eq!(read(&path).unwrap(), infinite);
+    std::fs::write(&path, ascii(&infinite, "float")).unwrap();
+    assert_eq!(read(&path).unwrap(), infinite);
+
+    type Spoil = fn(&mut SplatData);
+    let spoilt: [(&str, Spoil); 5] = [
+        ("scale_2 is inf", |s| s.log_scales[1][2] = f32::INFINITY),
+        ("scale_0 is NaN", |s| s.log_scales[1][0] = f32::NAN),
+        ("opacity is NaN", |s| s.opacity_logits[1] = f32::NAN),
+        ("f_dc_0 is -inf", |s| s.sh0[1][0] = f32::NEG_INFINITY),
+        ("rot_1 is inf", |s| s.quats[1][1] = f32::INFINITY),
+    ];
+    for (what, spoil) in spoilt {
+        let mut bad = infinite.clone();
+        spoil(&mut bad);
+        let on_writing = write(&path, &bad).unwrap_err().to_string();
+        let on_reading = error_of(ascii(&bad, "float").as_bytes()).to_string();
+        for message in [on_writing, on_reading] {
+            assert!(
+                message.contains(&format!("Gaussian 1: {what}")),
+                "{message}"
+            );
+        }
+    }
+}
+
 #[test]
 fn headers_that_do_not_fit_are_named() {
     let text = ascii(&scene(2, 1), "float");

@@ -88,10 +88,15 @@ pub(super) fn middle(positions: Vec<[f64; 3]>) -> [[f64; 2]; 3] {
     })
 }
 
-/// The range of `values`, widened to whole numbers.
+/// The range of those `values` that are finite, widened to whole numbers; a flat Gaussian's scale is minus infinity.
 fn whole_range(values: impl Iterator<Item = f64>) -> (f64, f64) {
-    let range = (f64::INFINITY, f64::NEG_INFINITY);
-    let (least, most) = values.fold(range, |(l, m), value| (l.min(value), m.max(value)));
+    let range = values
+        .filter(|value| value.is_finite())
+        .fold(None, |range, value| {
+            let (least, most) = range.unwrap_or((value, value));
+            Some((value.min(least), value.max(most)))
+        });
+    let (least, most) = range.unwrap_or((0.0, 0.0));
     let least = least.floor();
     (least, most.ceil().max(least + 1.0))
 }
@@ -113,6 +118,12 @@ mod tests {
             sh_degree: 1,
         };
         let text = describe(Path::new("a.ply"), &scene);
+        // Flat ones are counted, and have no influence on the range.
+        assert_eq!(
+            whole_range([f64::NEG_INFINITY, -1.5, 2.5].into_iter()),
+            (-2.0, 3.0)
+        );
+        assert_eq!(whole_range([f64::NEG_INFINITY].into_iter()), (0.0, 1.0));
         for line in [
             "Gaussians  2",
             "SH degree  1",
