@@ -24,7 +24,6 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         steps,
         ..TrainConfig::default()
     };
-    let settings = config.render_settings(3);
     let loss = LossTerms::new()
         .term("charbonnier", 0.8, |view, rendered| {
             Ok(charbonnier(rendered.image() - view.image()))
@@ -50,7 +49,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let scores = evaluate(
         &trained.gaussians,
         &views,
-        &settings,
+        &trained.render_settings,
         &Device::flex(),
         |_, _| {},
     )?;

@@ -3,7 +3,10 @@
 use burn::module::{Module, Param};
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use splat_ops::device::reads_half;
-use splat_ops::{OpError, Projected, SH_DEGREE_MAX, exp, sh_coefficient_count, sh_colors, sigmoid};
+use splat_ops::{
+    OpError, Projected, SH_DEGREE_MAX, ShColorSettings, exp, sh_coefficient_count, sh_colors,
+    sigmoid,
+};
 
 use crate::files::SplatData;
 
@@ -151,7 +154,7 @@ impl Gaussians {
         sigmoid(self.opacity_logits.val())
     }
 
-    /// Colours `[C, N, 3]` as cameras with the given centres `[C, 3]` see them, with spherical harmonics up to `degree`; only
+    /// Colours `[C, N, 3]` as cameras with the given centres `[C, 3]` see them, see [`sh_colors`]; only
     /// of those that were not culled, if what the same cameras have `seen` is given (the others are black).
     ///
     /// # Errors
@@ -159,7 +162,7 @@ impl Gaussians {
     pub fn colors(
         &self,
         centers: Tensor<2>,
-        degree: usize,
+        settings: impl Into<ShColorSettings>,
         seen: Option<&Projected>,
     ) -> Result<Tensor<3>, OpError> {
         sh_colors(
@@ -167,7 +170,7 @@ impl Gaussians {
             self.sh_rest.as_ref().map(|rest| rest.val()),
             self.means.val(),
             centers,
-            degree,
+            settings,
             seen,
         )
     }

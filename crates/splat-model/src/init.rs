@@ -1,22 +1,26 @@
 //! Initial Gaussians from SfM points (3DGS section 5.1).
 
 use core::num::NonZero;
+use std::collections::HashMap;
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use serde::{Deserialize, Serialize};
 use splat_ops::sh_coefficient_count;
 
-use crate::Camera;
+use crate::SceneScale;
 use crate::files::SplatData;
 
 /// Value of the constant spherical harmonic, 1 / (2 sqrt(pi)).
 const SH_C0: f64 = 0.282_094_791_773_878_14;
 
+/// Level of 8 bits at which a channel starts that is 0 in the photos.
+const DARKEST_LEVEL: f64 = 0.5;
+
 /// How the first Gaussians are made.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct InitSettings {
-    /// Opacity of every Gaussian. Default 0.1.
+    /// Opacity of every Gaussian, between 1/255, below which nothing is drawn, and 1. Default 0.1.
     pub opacity: f64,
     /// Scale, in root mean squares of the distances to the nearest points. Default 1.
     pub scale: f64,
@@ -51,15 +55,16 @@ pub enum InitError {
 /// One Gaussian per point: the point's colour, an isotropic scale of the root mean square of the
 /// distances to its three nearest neighbours, no rotation.
 ///
-/// `extent` is the size of the scene in world units; it bounds the scale from below (by 1e-7 of it),
-/// where points coincide, and is the scale of a single point.
+/// Everything starts where gradients reach it. Neighbours are points in other places, since points that coincide would
+/// have no size (where all do, `scene` gives it); and a channel of level 0 starts at half a level, above the clamp of
+/// colours at zero.
 ///
 /// # Errors
 /// When there is no point or one is not finite.
 pub fn splats_from_points(
     positions: &[[f32; 3]],
     colors: &[[u8; 3]],
-    extent: f64,
+    scene: SceneScale,
     settings: &InitSettings,
 ) -> Result<SplatData, InitError> {
     if positions.is_empty() {
@@ -75,14 +80,13 @@ pub fn splats_from_points(
     let log_scales = neighbour_distances(positions)
         .into_iter()
         .map(|distance| {
-            let distance = if n > 1 { distance } else { extent };
-            let scale = (distance * settings.scale).max(extent * 1e-7).max(1e-20);
+            let scale = distance.unwrap_or(scene.length()) * settings.scale;
             [scale.ln() as f32; 3]
         })
         .collect();
-    let sh0 =
-        |color: &[u8; 3]| color.map(|channel| ((f64::from(channel) / 255.0 - 0.5) / SH_C0) as f32);
-    let opacity = settings.opacity.clamp(1e-6, 1.0 - 1e-6);
+    let level = |channel: u8| f64::from(channel).max(DARKEST_LEVEL) / 255.0;
+    let sh0 = |color: &[u8; 3]| color.map(|channel| ((level(channel) - 0.5) / SH_C0) as f32);
+    let opacity = settings.opacity;
     Ok(SplatData {
         origin: [0.0; 3],
         means: positions.to_vec(),
@@ -95,21 +99,30 @@ pub fn splats_from_points(
     })
 }
 
-/// Per point the root mean square of the distances to its three nearest neighbours (fewer where
-/// there are fewer), zero for a single point.
-fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<f64> {
+/// Per point the root mean square of the distances to the three nearest other places where there are points (fewer where
+/// there are fewer); none where all points are in one place.
+fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<Option<f64>> {
     const NEIGHBOURS: usize = 3;
-    let points: Vec<[f64; 3]> = positions.iter().map(|p| p.map(f64::from)).collect();
-    // The nearest point is the point itself.
-    let (Ok(tree), Some(count)) = (
-        ImmutableKdTree::<f64, 3>::new_from_slice(&points),
-        NonZero::new((NEIGHBOURS + 1).min(points.len())),
-    ) else {
-        return vec![0.0; points.len()];
+    // Zero and minus zero are one place.
+    let place = |position: &[f32; 3]| position.map(|x| (x + 0.0).to_bits());
+    let mut indices = HashMap::with_capacity(positions.len());
+    let mut places: Vec<[f64; 3]> = Vec::with_capacity(positions.len());
+    for position in positions {
+        indices.entry(place(position)).or_insert_with(|| {
+            places.push(position.map(f64::from));
+            places.len() - 1
+        });
+    }
+    let count = match NonZero::new((NEIGHBOURS + 1).min(places.len())) {
+        Some(count) if places.len() > 1 => count,
+        _ => return vec![None; positions.len()],
     };
-    points
+    let tree = ImmutableKdTree::<f64, 3>::new_from_slice(&places)
+        .expect("indices of points fit the tree's, which are 64 bits");
+    let distances: Vec<f64> = places
         .iter()
         .map(|point| {
+            // The nearest place is the point's own.
             let nearest = tree
                 .query(point)
                 .nearest_n::<SquaredEuclidean<f64>>(count)
@@ -118,38 +131,18 @@ fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<f64> {
             let total: f64 = nearest.iter().map(|neighbour| neighbour.distance).sum();
             (total / others as f64).sqrt()
         })
-        .collect()
-}
-
-/// Where the means of a scene should count from: the world's zero, unless it is so far away that 32-bit floats
-/// would round visible detail away; then the middle of the cameras, in whole units.
-pub fn scene_origin(cameras: &[Camera]) -> [f64; 3] {
-    /// From 100 scenes away on, a float resolves less than 1e-5 of the scene.
-    const FAR: f64 = 100.0;
-    let positions = cameras.iter().map(Camera::position);
-    let mean = positions.sum::<glam::DVec3>() / cameras.len().max(1) as f64;
-    if mean.abs().max_element() > FAR * scene_scale(cameras) {
-        mean.round().to_array()
-    } else {
-        [0.0; 3]
-    }
-}
-
-/// Size of a scene as 3DGS measures it: 1.1 times the largest distance of a camera from the mean
-/// camera, in world units. With one camera, or several in one place, 1.
-pub fn scene_scale(cameras: &[Camera]) -> f64 {
-    let positions: Vec<_> = cameras.iter().map(Camera::position).collect();
-    let mean = positions.iter().sum::<glam::DVec3>() / positions.len().max(1) as f64;
-    let radius = positions
-        .iter()
-        .map(|position| position.distance(mean))
-        .fold(0.0, f64::max);
-    if radius > 0.0 { 1.1 * radius } else { 1.0 }
+        .collect();
+    let distance = |position: &[f32; 3]| Some(distances[*indices.get(&place(position))?]);
+    positions.iter().map(distance).collect()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn scene() -> SceneScale {
+        SceneScale::new(5.0).unwrap()
+    }
 
     #[test]
     fn scales_come_from_the_three_nearest_points() {
@@ -160,40 +153,43 @@ mod tests {
             [0.0, 0.0, 3.0],
             [9.0; 3],
         ];
-        let splats =
-            splats_from_points(&positions, &[[255, 0, 128]; 5], 1.0, &Default::default()).unwrap();
+        let colors = [[255, 0, 128]; 5];
+        let splats = splats_from_points(&positions, &colors, scene(), &Default::default()).unwrap();
         let expected = ((1.0 + 4.0 + 9.0) / 3.0f64).sqrt().ln();
         assert!((f64::from(splats.log_scales[0][0]) - expected).abs() < 1e-6);
         assert_eq!(splats.sh_rest.len(), 5 * 15 * 3);
+        // Four points in the place of the first change nothing for it, and have its scale.
+        let mut doubled = positions.to_vec();
+        doubled.extend([[0.0; 3], [-0.0; 3], [0.0; 3], [0.0; 3]]);
+        let colors = [[9; 3]; 9];
+        let again = splats_from_points(&doubled, &colors, scene(), &Default::default()).unwrap();
+        assert_eq!(again.log_scales[..5], splats.log_scales);
+        assert_eq!(again.log_scales[5..], [splats.log_scales[0]; 4]);
     }
 
     #[test]
-    fn only_a_scene_far_from_zero_gets_an_origin() {
-        let camera = |x: f64, y: f64| Camera {
-            viewmat: glam::DMat4::from_translation(glam::DVec3::new(-x, -y, 0.0)),
-            intrinsics: [50.0, 50.0, 8.0, 8.0],
-            size: splat_ops::ImageSize {
-                width: 16,
-                height: 16,
-            },
-        };
-        let near = [camera(0.0, 3.0), camera(2.0, 3.0), camera(4.0, 50.0)];
-        assert_eq!(scene_origin(&near), [0.0; 3]);
-        let far = [camera(4e6, 3.25), camera(4e6 + 2.0, 3.5)];
-        assert_eq!(scene_origin(&far), [4_000_001.0, 3.0, 0.0]);
-    }
-
-    #[test]
-    fn coincident_points_and_single_points_get_a_finite_scale() {
+    fn points_in_one_place_are_as_large_as_the_scene() {
         for n in [1, 2, 3, 1000] {
-            let splats = splats_from_points(
-                &vec![[1.0, 2.0, 3.0]; n],
-                &vec![[9; 3]; n],
-                5.0,
-                &Default::default(),
-            )
-            .unwrap();
-            assert!(splats.log_scales.iter().flatten().all(|x| x.is_finite()));
+            let points = vec![[1.0, 2.0, 3.0]; n];
+            let splats =
+                splats_from_points(&points, &vec![[9; 3]; n], scene(), &Default::default());
+            assert_eq!(splats.unwrap().log_scales, vec![[5.0f32.ln(); 3]; n]);
+        }
+    }
+
+    /// `max(SH + 0.5, 0)` passes nothing on below zero.
+    #[test]
+    fn no_colour_starts_below_the_clamp() {
+        let colors: Vec<[u8; 3]> = (0..=255).map(|level| [level; 3]).collect();
+        let points: Vec<[f32; 3]> = (0..=255).map(|i| [i as f32, 0.0, 0.0]).collect();
+        let splats = splats_from_points(&points, &colors, scene(), &Default::default()).unwrap();
+        for (level, sh0) in splats.sh0.iter().enumerate() {
+            let color = sh0[0] * SH_C0 as f32 + 0.5;
+            assert!(color > 0.0, "level {level} starts at {color:e}");
+            assert!(
+                (color * 255.0 - level as f32).abs() <= 0.501,
+                "level {level}: {color}"
+            );
         }
     }
 
@@ -201,12 +197,12 @@ mod tests {
     fn bad_points_are_named() {
         let settings = InitSettings::default();
         assert_eq!(
-            splats_from_points(&[], &[], 1.0, &settings),
+            splats_from_points(&[], &[], scene(), &settings),
             Err(InitError::NoPoints)
         );
         let points = [[0.0; 3], [f32::NAN, 0.0, 0.0]];
         assert_eq!(
-            splats_from_points(&points, &[[0; 3]; 2], 1.0, &settings),
+            splats_from_points(&points, &[[0; 3]; 2], scene(), &settings),
             Err(InitError::NotFinite { index: 1 })
         );
     }

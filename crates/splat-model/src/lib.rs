@@ -10,11 +10,13 @@ mod init;
 pub mod losses;
 mod rates;
 mod render;
+mod scene_scale;
 
 pub use adam::{EditLog, RowEdit, SplatAdam};
 pub use camera::{Camera, CameraTensors};
 pub use gaussians::{Gaussians, ShPrecision};
-pub use init::{InitError, InitSettings, scene_origin, scene_scale, splats_from_points};
+pub use init::{InitError, InitSettings, splats_from_points};
 pub use rates::{Field, LearningRates, splat_optimizer};
 pub use render::{RenderSettings, project_gaussians, render, render_projected};
+pub use scene_scale::SceneScale;
 pub use splat_ops as ops;

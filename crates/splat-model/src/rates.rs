@@ -7,6 +7,7 @@ use burn::optim::lr_scheduler::module_lr_scheduler::{ModuleLearningRate, ModuleL
 use serde::{Deserialize, Serialize};
 use splat_ops::AdamRows;
 
+use crate::SceneScale;
 use crate::adam::{EditLog, SplatAdam};
 
 /// The fields of [`Gaussians`](crate::Gaussians), by the names they have there.
@@ -98,10 +99,10 @@ impl LearningRates {
     }
 
     /// The rates at a step (from 0) of a run of `steps`, for Burn's module optimiser.
-    pub fn at(&self, step: usize, steps: usize, scene_scale: f64) -> ModuleLearningRate {
+    pub fn at(&self, step: usize, steps: usize, scene: SceneScale) -> ModuleLearningRate {
         let progress = step as f64 / steps.max(1) as f64;
         let rate = |field| match field {
-            Field::Means => self.means * scene_scale * self.means_final.powf(progress),
+            Field::Means => self.means * scene.length() * self.means_final.powf(progress),
             Field::LogScales => self.scales,
             Field::Quats => self.quats,
             Field::OpacityLogits => self.opacities,
@@ -120,7 +121,7 @@ impl LearningRates {
 
 /// A module optimiser with one [`SplatAdam`] per field, stepping `rows`, and the logs through which density control
 /// tells them of edited rows, in the order of [`Field::ALL`].
-pub fn splat_optimizer(rows: AdamRows) -> (ModuleOptimizer, [EditLog; 6]) {
+pub fn splat_optimizer(rows: AdamRows, scene: SceneScale) -> (ModuleOptimizer, [EditLog; 6]) {
     let logs: [EditLog; 6] = Default::default();
     let fallback = ModuleOptimizer::from(SplatAdam::new(EditLog::default()));
     let optimizer = Field::ALL
@@ -129,6 +130,9 @@ pub fn splat_optimizer(rows: AdamRows) -> (ModuleOptimizer, [EditLog; 6]) {
         .fold(fallback, |optimizer, (field, log)| {
             let mut adam = SplatAdam::new(log.clone());
             adam.rows = rows;
+            if field == Field::Means {
+                adam.epsilon = scene.means_epsilon();
+            }
             optimizer.with_group(field.group(), adam, None)
         });
     (optimizer, logs)

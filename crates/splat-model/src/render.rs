@@ -2,7 +2,8 @@
 
 use burn::tensor::Tensor;
 use splat_ops::{
-    OpError, ProjectSettings, Projected, RasterizeSettings, Rendered, project, rasterize,
+    ClampGradient, OpError, ProjectSettings, Projected, RasterizeSettings, Rendered,
+    ShColorSettings, project, rasterize,
 };
 
 use crate::{CameraTensors, Gaussians};
@@ -12,6 +13,8 @@ use crate::{CameraTensors, Gaussians};
 pub struct RenderSettings {
     /// Highest degree of spherical harmonics to evaluate; at most what the model has.
     pub sh_degree: usize,
+    /// Gradient of the clamp of colours at zero; [`ClampGradient::Recovering`] for training. Default exact.
+    pub clamp_gradient: ClampGradient,
     /// Multiply opacities by what the low-pass filter took away (Yu et al. 2024, Mip-Splatting).
     pub antialias: bool,
     /// Colour behind everything; black (and no work) without one.
@@ -66,8 +69,11 @@ pub fn render_projected(
     cameras: &CameraTensors,
     settings: &RenderSettings,
 ) -> Result<Rendered, OpError> {
-    let degree = settings.sh_degree.min(gaussians.sh_degree());
-    let colors = gaussians.colors(cameras.centers(), degree, Some(projected))?;
+    let shading = ShColorSettings {
+        degree: settings.sh_degree.min(gaussians.sh_degree()),
+        clamp_gradient: settings.clamp_gradient,
+    };
+    let colors = gaussians.colors(cameras.centers(), shading, Some(projected))?;
     let [count, _, _] = colors.dims();
     let background = settings.background.map(|color| {
         let color = Tensor::<1>::from_floats(color, &colors.device());

@@ -239,3 +239,62 @@ fn high_learning_rates_are_named_with_their_factor() {
         assert!((factor - 10.0).abs() < 1e-9, "{name}: {factor}");
     }
 }
+
+/// Black points start at the clamp of colours at zero, behind which nothing learns. Colours take at most 7e-4 a step.
+#[test]
+fn black_points_learn_their_colours() {
+    let mean_loss = |blacken: fn(usize) -> bool| {
+        let mut capture = capture();
+        for (index, point) in capture.points.iter_mut().enumerate() {
+            if blacken(index) {
+                point.color = [0; 3];
+            }
+        }
+        let trained = Trainer::builder()
+            .capture(capture)
+            .config(TrainConfig {
+                steps: 1_500,
+                ..config()
+            })
+            .device(Device::flex())
+            .build()
+            .unwrap()
+            .run()
+            .unwrap();
+        let sh0 = trained.gaussians.to_data().sh0;
+        // A channel that never got a gradient is where black begins: at level 0, or at half a level.
+        let start = |level: f64| ((level / 255.0 - 0.5) / 0.282_094_791_773_878_14) as f32;
+        let starts = [start(0.0), start(0.5)];
+        let channels = sh0.iter().flatten();
+        let stuck = channels.filter(|x| starts.contains(x)).count();
+        let share = stuck as f64 / (3 * sh0.len()) as f64;
+        (trained.history.mean_loss(50).unwrap(), share)
+    };
+    let (usual, _) = mean_loss(|_| false);
+    for blacken in [(|_| true) as fn(usize) -> bool, |index| index % 10 == 0] {
+        let (loss, stuck) = mean_loss(blacken);
+        println!(
+            "loss {loss:.4}, usually {usual:.4}; {:.1} % stuck",
+            100.0 * stuck
+        );
+        assert!(loss < 1.3 * usual, "{loss} instead of {usual}");
+        assert!(stuck < 0.02, "{:.1} % never learned", 100.0 * stuck);
+    }
+}
+
+#[test]
+fn an_opacity_that_nothing_could_bring_back_is_refused() {
+    type Change = fn(&mut TrainConfig);
+    let changes: [(&str, Change); 3] = [
+        ("init.opacity", |c| c.init.opacity = 0.003),
+        ("density.reset_opacity", |c| c.density.reset_opacity = 0.003),
+        ("density.prune_opacity", |c| c.density.prune_opacity = 0.02),
+    ];
+    for (field, change) in changes {
+        let mut config = config();
+        change(&mut config);
+        let problem = config.problem().unwrap();
+        assert!(problem.contains(field), "{problem}");
+    }
+    assert_eq!(config().problem(), None);
+}

@@ -9,10 +9,10 @@ use serde::{Deserialize, Serialize};
 use splat_ops::{OpError, Projected, ScreenStatistics};
 
 use super::edit::{RowPlan, apply_plan, clamp_opacities};
-use crate::Gaussians;
 use crate::adam::EditLog;
 use crate::files::SplatData;
 use crate::gaussians::host;
+use crate::{Gaussians, SceneScale};
 
 /// The run length that the milestones below are stated for.
 const REFERENCE_STEPS: f64 = 30_000.0;
@@ -75,8 +75,8 @@ impl Default for AdaptiveSettings {
 pub struct RunShape {
     /// Steps of the whole run.
     pub steps: usize,
-    /// See [`scene_scale`](crate::scene_scale).
-    pub scene_scale: f64,
+    /// Size of the scene.
+    pub scene_scale: SceneScale,
     /// Seed of the run.
     pub seed: u64,
 }
@@ -206,7 +206,7 @@ impl AdaptiveDensity {
         let settings = &self.settings;
         let scale = |row: usize| {
             let largest = splats.log_scales[row].into_iter().fold(f32::MIN, f32::max);
-            f64::from(largest).exp() / self.run.scene_scale
+            f64::from(largest).exp() / self.run.scene_scale.length()
         };
         let room = settings
             .max_gaussians
@@ -291,11 +291,13 @@ impl AdaptiveDensity {
 mod tests {
     use super::*;
 
-    const RUN: RunShape = RunShape {
-        steps: 30_000,
-        scene_scale: 2.0,
-        seed: 1,
-    };
+    fn run(steps: usize) -> RunShape {
+        RunShape {
+            steps,
+            scene_scale: SceneScale::new(2.0).unwrap(),
+            seed: 1,
+        }
+    }
 
     /// Four Gaussians: still, small and growing, large and growing, transparent.
     fn splats() -> SplatData {
@@ -315,7 +317,7 @@ mod tests {
 
     #[test]
     fn small_ones_are_cloned_large_ones_split_transparent_ones_pruned() {
-        let density = AdaptiveDensity::new(AdaptiveSettings::default(), RUN);
+        let density = AdaptiveDensity::new(AdaptiveSettings::default(), run(30_000));
         let (plan, report) = density.plan(600, &splats(), &GRADIENTS);
         assert_eq!((report.cloned, report.split, report.pruned), (1, 1, 1));
         assert_eq!(plan.source, [0, 1, 1, 2, 2]);
@@ -338,7 +340,7 @@ mod tests {
             max_gaussians: Some(5),
             ..Default::default()
         };
-        let density = AdaptiveDensity::new(settings, RUN);
+        let density = AdaptiveDensity::new(settings, run(30_000));
         let grown = |gradients: [f64; 4]| {
             let plan = density.plan(600, &splats(), &gradients).0;
             plan.source[plan.survives.iter().filter(|survives| **survives).count()]
@@ -370,7 +372,7 @@ mod tests {
             prune_opacity: 0.9,
             ..Default::default()
         };
-        let density = AdaptiveDensity::new(settings, RUN);
+        let density = AdaptiveDensity::new(settings, run(30_000));
         let (plan, report) = density.plan(600, &splats(), &GRADIENTS);
         assert_eq!((report.cloned, report.split, report.pruned), (1, 0, 0));
         assert_eq!(plan.source.len(), 5);
@@ -380,7 +382,7 @@ mod tests {
     fn large_ones_are_pruned_only_later() {
         let mut splats = splats();
         splats.log_scales[0] = [0.5f32.ln(); 3];
-        let density = AdaptiveDensity::new(AdaptiveSettings::default(), RUN);
+        let density = AdaptiveDensity::new(AdaptiveSettings::default(), run(30_000));
         let pruned = |step| density.plan(step, &splats, &[0.0; 4]).1.pruned;
         assert_eq!((pruned(600), pruned(3_100)), (1, 2));
     }
@@ -389,7 +391,7 @@ mod tests {
     #[test]
     fn a_gradient_that_is_not_finite_does_not_hide_other_views() {
         let device = burn::tensor::Device::flex();
-        let mut density = AdaptiveDensity::new(AdaptiveSettings::default(), RUN);
+        let mut density = AdaptiveDensity::new(AdaptiveSettings::default(), run(30_000));
         let size = splat_ops::ImageSize {
             width: 2,
             height: 2,
@@ -406,18 +408,7 @@ mod tests {
 
     #[test]
     fn milestones_shrink_with_the_run() {
-        let run = RunShape {
-            steps: 3_000,
-            ..RUN
-        };
-        assert_eq!(run.milestone(15_000), 1_500);
-        assert_eq!(
-            RunShape {
-                steps: 60_000,
-                ..RUN
-            }
-            .milestone(500),
-            500
-        );
+        assert_eq!(run(3_000).milestone(15_000), 1_500);
+        assert_eq!(run(60_000).milestone(500), 500);
     }
 }

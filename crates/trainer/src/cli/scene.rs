@@ -6,7 +6,7 @@ use burn::tensor::Device;
 use clap::ValueEnum;
 use splat_model::files::ply;
 use splat_model::ops::SH_DEGREE_MAX;
-use splat_model::{Gaussians, RenderSettings, ShPrecision};
+use splat_model::{Gaussians, RenderSettings, SceneScale, ShPrecision};
 
 use super::{Failure, GlobalArgs};
 use crate::train::TrainConfig;
@@ -30,14 +30,16 @@ pub(super) fn open(
     global: &GlobalArgs,
 ) -> Result<(Gaussians, RenderSettings), Failure> {
     let data = ply::read(path)?;
+    let scene = SceneScale::of_splats(&data);
     let mut settings = RenderSettings {
         sh_degree: SH_DEGREE_MAX,
+        project: scene.project_settings(),
         ..RenderSettings::default()
     };
     let config = path.with_file_name("config.toml");
     if config.is_file() {
         let config: TrainConfig = read_config(&config)?;
-        settings = config.render_settings(SH_DEGREE_MAX);
+        settings = config.render_settings(SH_DEGREE_MAX, scene);
         if config.antialias || config.background.is_some() {
             global.say("rendering as the config.toml beside the scene says");
         }

@@ -8,7 +8,6 @@ use std::time::Duration;
 
 use clap::{Args, ValueEnum};
 use splat_model::files::ply;
-use splat_model::ops::SH_DEGREE_MAX;
 
 use super::device::ChosenDevice;
 use super::{Failure, GlobalArgs, device, eval, interrupt, print, scene};
@@ -244,14 +243,19 @@ fn finish(
     write_losses(&out.join("losses.csv"), &trained.history)?;
 
     let views: Vec<&View> = capture.test_views().collect();
-    let settings = config.render_settings(SH_DEGREE_MAX);
     let mut written = Ok(());
     let keep = |view: &View, rendered: Vec<f32>| {
         if written.is_ok() {
             written = write_view(&out.join("views"), view, &rendered);
         }
     };
-    let scores = evaluate(&trained.gaussians, &views, &settings, &chosen.device, keep)?;
+    let scores = evaluate(
+        &trained.gaussians,
+        &views,
+        &trained.render_settings,
+        &chosen.device,
+        keep,
+    )?;
     written?;
 
     let seconds = |time: Duration| time.as_secs_f64();

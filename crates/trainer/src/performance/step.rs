@@ -126,9 +126,10 @@ pub(super) fn work_on(
     config: &TrainConfig,
     device: &Device,
 ) -> Result<Work, PerformanceError> {
-    let gaussians = trainer(capture, config, device)?.gaussians().valid();
+    let trainer = trainer(capture, config, device)?;
+    let gaussians = trainer.gaussians().valid();
     let views: Vec<&View> = capture.train_views().collect();
-    let settings = config.render_settings(0);
+    let settings = config.render_settings(0, trainer.scene_scale());
     Work::count(&gaussians, &sample(&views, VIEWS), &settings, device)
 }
 

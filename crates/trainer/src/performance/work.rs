@@ -96,7 +96,7 @@ pub(super) fn sample<'a>(views: &[&'a View], most: usize) -> Vec<&'a View> {
 
 #[cfg(test)]
 mod tests {
-    use splat_model::splats_from_points;
+    use splat_model::{SceneScale, splats_from_points};
 
     use super::*;
     use crate::performance::scaling::{PhotoSize, synthetic_capture};
@@ -145,7 +145,13 @@ mod tests {
             .map(|p| p.position.map(|x| x as f32))
             .collect();
         let colors: Vec<_> = capture.points.iter().map(|p| p.color).collect();
-        let mut data = splats_from_points(&positions, &colors, 1.0, &Default::default()).unwrap();
+        let mut data = splats_from_points(
+            &positions,
+            &colors,
+            SceneScale::new(1.0).unwrap(),
+            &Default::default(),
+        )
+        .unwrap();
         // From faint to nearly opaque, so that pixels stop.
         for (index, logit) in data.opacity_logits.iter_mut().enumerate() {
             *logit = (index % 10) as f32 - 4.0;

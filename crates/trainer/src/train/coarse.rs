@@ -42,6 +42,8 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
+    use splat_model::SceneScale;
+
     use crate::capture::CaptureOptions;
 
     #[test]
@@ -54,7 +56,7 @@ mod tests {
             };
             let run = RunShape {
                 steps,
-                scene_scale: 1.0,
+                scene_scale: SceneScale::new(1.0).unwrap(),
                 seed: 0,
             };
             at.map(|step| factor(&config, run, step))
@@ -64,7 +66,7 @@ mod tests {
         assert_eq!(factors(3_000, [0, 24, 25, 49, 50, 2_999]), expected);
         let run = RunShape {
             steps: 100,
-            scene_scale: 1.0,
+            scene_scale: SceneScale::new(1.0).unwrap(),
             seed: 0,
         };
         assert_eq!(factor(&TrainConfig::default(), run, 0), 1);

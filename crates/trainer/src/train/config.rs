@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 use splat_model::density::AdaptiveSettings;
-use splat_model::ops::{AdamRows, RasterizeSettings};
-use splat_model::{InitSettings, LearningRates, RenderSettings};
+use splat_model::ops::{AdamRows, ClampGradient, RasterizeSettings};
+use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale};
 
 /// More would leave no photo anything to see.
 const MOST_HALVINGS: u32 = 8;
@@ -70,17 +70,18 @@ impl Default for TrainConfig {
 }
 
 impl TrainConfig {
-    /// How to render at a degree of spherical harmonics.
-    pub fn render_settings(&self, sh_degree: usize) -> RenderSettings {
+    /// How to render a scene of this size, up to a degree of spherical harmonics.
+    pub fn render_settings(&self, sh_degree: usize, scene: SceneScale) -> RenderSettings {
         RenderSettings {
             sh_degree,
+            clamp_gradient: ClampGradient::Recovering,
             antialias: self.antialias,
             background: self.background,
             rasterize: RasterizeSettings {
                 deterministic: self.deterministic,
                 ..RasterizeSettings::default()
             },
-            ..RenderSettings::default()
+            project: scene.project_settings(),
         }
     }
 
@@ -91,6 +92,27 @@ impl TrainConfig {
         } else {
             AdamRows::All
         }
+    }
+
+    /// An opacity that gradients could not bring back: below the cut nothing is drawn and nothing learns, and what a reset
+    /// leaves below the opacity of pruning is removed.
+    fn unreachable_opacity(&self) -> Option<String> {
+        let cut = RasterizeSettings::default().alpha_min;
+        let starts = [
+            ("init.opacity", self.init.opacity),
+            ("density.reset_opacity", self.density.reset_opacity),
+        ];
+        if let Some((field, value)) = starts.iter().find(|(_, value)| *value <= cut) {
+            return Some(format!(
+                "`{field}` must be above 1/255, below which nothing is drawn or learned, it is {value}"
+            ));
+        }
+        let (reset, prune) = (self.density.reset_opacity, self.density.prune_opacity);
+        (reset <= prune).then(|| {
+            format!(
+                "`density.reset_opacity` {reset} must be above `density.prune_opacity` {prune}, or every reset removes the scene"
+            )
+        })
     }
 
     /// What makes the settings unusable, if anything does: the field and the reason.
@@ -104,6 +126,11 @@ impl TrainConfig {
             ("rates.sh0", self.rates.sh0),
             ("rates.sh_rest", self.rates.sh_rest),
             ("init.scale", self.init.scale),
+        ];
+        let not_negative = [
+            ("density.grow_gradient", self.density.grow_gradient),
+            ("density.split_scale", self.density.split_scale),
+            ("density.prune_scale", self.density.prune_scale),
         ];
         let shares = [
             ("init.opacity", self.init.opacity),
@@ -138,8 +165,24 @@ impl TrainConfig {
                 "`{field}` must be positive and finite, it is {value}"
             ));
         }
+        if let Some((field, value)) = not_negative
+            .iter()
+            .find(|(_, value)| !(value.is_finite() && *value >= 0.0))
+        {
+            return Some(format!(
+                "`{field}` must be finite and not negative, it is {value}"
+            ));
+        }
+        if let Some(color) = self.background
+            && !color.iter().all(|channel| channel.is_finite())
+        {
+            return Some(format!("`background` must be finite, it is {color:?}"));
+        }
         if let Some((field, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
             return Some(format!("`{field}` must lie in [0, 1), it is {value}"));
+        }
+        if let Some(problem) = self.unreachable_opacity() {
+            return Some(problem);
         }
         let highest = splat_model::ops::SH_DEGREE_MAX;
         (self.init.sh_degree > highest).then(|| {

@@ -21,7 +21,7 @@ use splat_model::density::{AdaptiveDensity, RunShape};
 use splat_model::ops::device::keep_awake;
 use splat_model::ops::{OpError, SH_DEGREE_MAX};
 use splat_model::{
-    EditLog, Gaussians, InitError, project_gaussians, render_projected, scene_origin, scene_scale,
+    EditLog, Gaussians, InitError, RenderSettings, SceneScale, project_gaussians, render_projected,
     splat_optimizer, splats_from_points,
 };
 use tracing::trace_span;
@@ -104,6 +104,10 @@ pub struct Trained {
     pub gaussians: Gaussians,
     /// What was logged.
     pub history: History,
+    /// Size of the scene, from which every length of the run followed.
+    pub scene_scale: SceneScale,
+    /// How to render the model as it was trained, at its highest degree of spherical harmonics.
+    pub render_settings: RenderSettings,
     /// Steps done; fewer than asked for when interrupted.
     pub steps: usize,
     /// Time spent in steps, over all sessions of the run.
@@ -222,9 +226,10 @@ impl TrainerBuilder {
             .loss
             .unwrap_or_else(|| LossTerms::l1_ssim(self.config.ssim_weight));
         let cameras: Vec<_> = capture.views.iter().map(camera).collect();
+        let points: Vec<[f64; 3]> = capture.points.iter().map(|point| point.position).collect();
         let run = RunShape {
             steps: self.config.steps,
-            scene_scale: scene_scale(&cameras),
+            scene_scale: SceneScale::of_capture(&cameras, &points),
             seed: self.config.seed,
         };
         let device = self.device.without_autodiff().autodiff();
@@ -235,7 +240,7 @@ impl TrainerBuilder {
         let gaussians = match self.resume {
             Some(checkpoint) => checkpoint.restore(&mut state, &device)?,
             None => {
-                let origin = scene_origin(&cameras);
+                let origin = run.scene_scale.origin(&cameras);
                 first_gaussians(&capture, &config, run, origin, &device)?
             }
         };
@@ -307,7 +312,7 @@ struct State {
 
 impl State {
     fn new(config: &TrainConfig, run: RunShape, loss: &LossTerms) -> Self {
-        let (optimizer, edits) = splat_optimizer(config.adam_rows());
+        let (optimizer, edits) = splat_optimizer(config.adam_rows(), run.scene_scale);
         Self {
             optimizer,
             edits,
@@ -404,6 +409,10 @@ impl Trainer {
             checkpoint: Checkpoint::of(&self.gaussians, &self.state)?,
             gaussians: self.gaussians.valid(),
             history: self.state.history,
+            scene_scale: self.run.scene_scale,
+            render_settings: self
+                .config
+                .render_settings(SH_DEGREE_MAX, self.run.scene_scale),
             steps: self.state.step,
             elapsed: self.state.elapsed,
         })
@@ -452,6 +461,11 @@ impl Trainer {
         Ok(())
     }
 
+    /// Size of the scene, from which every length of the run follows.
+    pub fn scene_scale(&self) -> SceneScale {
+        self.run.scene_scale
+    }
+
     /// The Gaussians as they are after the last step.
     pub fn gaussians(&self) -> &Gaussians {
         &self.gaussians
@@ -465,7 +479,9 @@ impl Trainer {
         let cameras = camera(&view)
             .relative_to(self.gaussians.origin)
             .tensors(&self.device);
-        let settings = self.config.render_settings(self.sh_degree(step));
+        let settings = self
+            .config
+            .render_settings(self.sh_degree(step), self.run.scene_scale);
 
         let render = trace_span!("render").entered();
         let mut projected = project_gaussians(&self.gaussians, &cameras, &settings)?;
@@ -611,7 +627,9 @@ impl Trainer {
         if held_out.is_empty() {
             return Ok(());
         }
-        let settings = self.config.render_settings(SH_DEGREE_MAX);
+        let settings = self
+            .config
+            .render_settings(SH_DEGREE_MAX, self.run.scene_scale);
         let device = self.device.clone().without_autodiff();
         let scores = evaluate(
             &self.gaussians.valid(),

@@ -151,7 +151,9 @@ impl fmt::Display for Warning {
             ),
             Self::CompactPoints { radius, distance } => write!(
                 f,
-                "half of the points lie within {radius:.3e} of one place, {distance:.3e} from the cameras; points and cameras seem to differ in scale"
+                "half of the points lie within {} of one place, {} from the cameras; points and cameras seem to differ in scale",
+                Length(*radius),
+                Length(*distance)
             ),
             Self::LargeGaussians {
                 scale,
@@ -159,12 +161,16 @@ impl fmt::Display for Warning {
                 init_scale,
             } => write!(
                 f,
-                "the first Gaussians are {scale:.3} wide at a distance of {distance:.3}, each covers most of a picture; init.scale is {init_scale} (usually 1), or the points are too few"
+                "the first Gaussians are {} wide at a distance of {}, each covers most of a picture; init.scale is {init_scale} (usually 1), or the points are too few",
+                Length(*scale),
+                Length(*distance)
             ),
             Self::CamerasInsidePoints { views, near, usual } => write!(
                 f,
-                "{}: the camera stands among the points: 1 % of them lie within {near:.3}, usually it is {usual:.3}; remove the photo or correct its pose",
-                Names(views)
+                "{}: the camera stands among the points: 1 % of them lie within {}, usually it is {}; remove the photo or correct its pose",
+                Names(views),
+                Length(*near),
+                Length(*usual)
             ),
             Self::CamerasFarAway {
                 views,
@@ -172,8 +178,10 @@ impl fmt::Display for Warning {
                 usual,
             } => write!(
                 f,
-                "{}: the camera is {distance:.3} from the points, usually it is {usual:.3}; remove the photo or correct its pose",
-                Names(views)
+                "{}: the camera is {} from the points, usually it is {}; remove the photo or correct its pose",
+                Names(views),
+                Length(*distance),
+                Length(*usual)
             ),
             Self::CamerasSeeFewPoints {
                 views,
@@ -220,6 +228,18 @@ impl fmt::Display for Warning {
                 f,
                 "the loss does not fall: {last:.4} after {step} steps, {first:.4} at the beginning; look at the photos, their cameras and the loss"
             ),
+        }
+    }
+}
+
+/// A length in the capture's unit, whatever that is: digits that mean something, in any order of magnitude.
+struct Length(f64);
+
+impl fmt::Display for Length {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self.0.abs() {
+            size if size == 0.0 || (0.1..1e6).contains(&size) => write!(f, "{:.3}", self.0),
+            _ => write!(f, "{:.3e}", self.0),
         }
     }
 }
@@ -277,6 +297,15 @@ mod tests {
         assert!(
             text.starts_with("rates.means is 10 x its default, rates.sh0 is 7.5 x"),
             "{text}"
+        );
+    }
+
+    #[test]
+    fn lengths_can_be_read_in_any_unit() {
+        let text = [0.0, 2.0, 123_456.7, 4.2e-6, 3.5e9].map(|length| Length(length).to_string());
+        assert_eq!(
+            text,
+            ["0.000", "2.000", "123456.700", "4.200e-6", "3.500e9"]
         );
     }
 

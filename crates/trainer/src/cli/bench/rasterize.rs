@@ -87,7 +87,8 @@ pub(super) fn report(
                 .device(device.clone())
                 .build()?;
             let name = format!("the first Gaussians of {}", capture.name);
-            (trainer.gaussians().valid(), config.render_settings(0), name)
+            let settings = config.render_settings(0, trainer.scene_scale());
+            (trainer.gaussians().valid(), settings, name)
         }
     };
     let views: Vec<&View> = capture.train_views().collect();
