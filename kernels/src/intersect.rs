@@ -116,8 +116,13 @@ pub struct Slots {
 /// Why there are no tile lists.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum IntersectError {
-    /// More (splat, tile) pairs than can be indexed.
-    TooManyInstances(u64),
+    /// More (splat, tile) pairs than can be indexed, or than a buffer of the device can hold.
+    TooManyInstances {
+        /// How many there are.
+        count: u64,
+        /// How many can be listed.
+        limit: u64,
+    },
     /// The device failed, in its words.
     Device(String),
 }
@@ -125,9 +130,9 @@ pub enum IntersectError {
 impl fmt::Display for IntersectError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::TooManyInstances(count) => write!(
+            Self::TooManyInstances { count, limit } => write!(
                 f,
-                "{count} pairs of a splat and a tile that it touches; at most {MAX_INSTANCES} can be rendered at once"
+                "{count} pairs of a splat and a tile that it touches; at most {limit} can be rendered at once"
             ),
             Self::Device(error) => write!(f, "the device failed: {error}"),
         }
@@ -140,11 +145,17 @@ impl std::error::Error for IntersectError {}
 /// [`MAX_SLOT_VALUES`] floats per instance.
 pub const MAX_INSTANCES: u64 = u32::MAX as u64 / MAX_SLOT_VALUES as u64;
 
+/// Instances that a device can list: each is one number in each of several buffers, whose size the device limits.
+fn max_instances(client: &Client) -> u64 {
+    let largest_buffer = client.properties().memory.max_page_size;
+    MAX_INSTANCES.min(largest_buffer / size_of::<u32>() as u64)
+}
+
 /// The one place that decides how many instances are too many. Asked before any list is allocated.
-fn check_instances(instances: u64) -> Result<usize, IntersectError> {
-    match usize::try_from(instances) {
-        Ok(count) if instances <= MAX_INSTANCES => Ok(count),
-        _ => Err(IntersectError::TooManyInstances(instances)),
+fn check_instances(count: u64, limit: u64) -> Result<usize, IntersectError> {
+    match usize::try_from(count) {
+        Ok(instances) if count <= limit => Ok(instances),
+        _ => Err(IntersectError::TooManyInstances { count, limit }),
     }
 }
 
@@ -561,7 +572,7 @@ pub(crate) fn floor(sizes: &Sizes) -> Bytes {
 /// number of instances.
 ///
 /// # Errors
-/// More than [`MAX_INSTANCES`] instances, or a failing device.
+/// More instances than can be indexed or than a buffer of the device holds, or a failing device.
 pub fn intersect(
     client: &Client,
     packed: &Buffer,
@@ -569,7 +580,7 @@ pub fn intersect(
     frames: &Frames,
 ) -> Result<TileLists, IntersectError> {
     let (counted, total) = Counted::new(client, packed, opacities, frames);
-    let instances = wait_for_instances(total)?;
+    let instances = wait_for_instances(client, total)?;
     Ok(counted.list(client, instances))
 }
 
@@ -584,12 +595,14 @@ pub(crate) fn intersect_ahead<R>(
     then: impl Fn(&TileLists) -> R,
 ) -> Result<(TileLists, R), IntersectError> {
     let (counted, total) = Counted::new(client, packed, opacities, frames);
+    let limit = max_instances(client) as usize;
     let ahead = room::expected().map(|capacity| {
+        let capacity = capacity.min(limit);
         let lists = counted.list(client, capacity);
         let result = then(&lists);
         (lists, result)
     });
-    let instances = wait_for_instances(total)?;
+    let instances = wait_for_instances(client, total)?;
     room::found(instances);
     Ok(match ahead {
         Some((mut lists, result)) if instances <= lists.instances => {
@@ -604,8 +617,9 @@ pub(crate) fn intersect_ahead<R>(
     })
 }
 
-fn wait_for_instances(total: PendingTotal<'_>) -> Result<usize, IntersectError> {
-    let instances = check_instances(total.wait().map_err(IntersectError::Device)?)?;
+fn wait_for_instances(client: &Client, total: PendingTotal<'_>) -> Result<usize, IntersectError> {
+    let count = total.wait().map_err(IntersectError::Device)?;
+    let instances = check_instances(count, max_instances(client))?;
     work::listed(instances);
     Ok(instances)
 }
@@ -778,12 +792,12 @@ mod tests {
     #[test]
     fn instances_are_refused_from_the_first_one_whose_gradients_cannot_be_indexed() {
         for instances in [0, 1, MAX_INSTANCES] {
-            assert_eq!(check_instances(instances), Ok(instances as usize));
+            let count = check_instances(instances, MAX_INSTANCES);
+            assert_eq!(count, Ok(instances as usize));
             assert!(instances * MAX_SLOT_VALUES as u64 <= u64::from(u32::MAX));
         }
         for instances in [MAX_INSTANCES + 1, 1 << 31, 1 << 32, (1 << 32) + 5, u64::MAX] {
-            let error = check_instances(instances).unwrap_err();
-            assert_eq!(error, IntersectError::TooManyInstances(instances));
+            let error = check_instances(instances, MAX_INSTANCES).unwrap_err();
             assert!(error.to_string().contains(&instances.to_string()));
         }
     }

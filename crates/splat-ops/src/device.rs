@@ -1,14 +1,13 @@
 //! What else there is to do with a device. Most of it is for benchmarks of CubeCL devices: what they are, what the kernels
 //! did there, how fast their memory is. Without such a device (or the features for one) there is nothing to tell.
 
-use burn::tensor::Device;
-#[cfg(feature = "cpu")]
-use burn::tensor::Tensor;
+use burn::tensor::{Device, Tensor};
 
+use crate::OpError;
 use crate::check::is_flex;
 pub use crate::memory::available_memory;
 #[cfg(feature = "cpu")]
-use crate::{OpError, Projected, RasterizeSettings, RasterizeWork};
+use crate::{Projected, RasterizeSettings, RasterizeWork};
 
 /// What the kernels did since the process began, over all devices; a piece of work is a difference of two.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -50,6 +49,23 @@ pub(crate) fn client(device: &Device) -> Option<cubecl::client::Client> {
         #[allow(unreachable_patterns, reason = "not so without the feature `cpu`")]
         _ => None,
     }
+}
+
+/// The values of a float tensor on the host, in single precision.
+///
+/// # Errors
+/// [`OpError::Device`] when the device failed, then or in whatever the tensor was computed by: a device that works on its
+/// own says so only when something is read.
+pub fn to_host<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>, OpError> {
+    let failed = |what: String| OpError::Device {
+        op: "reading a tensor",
+        what,
+    };
+    let data = tensor
+        .try_into_data()
+        .map_err(|error| failed(error.to_string()))?;
+    let values = data.convert::<f32>().try_into_vec();
+    values.map_err(|error| failed(format!("{error:?}")))
 }
 
 /// To be called where a training step or the like begins. On the CPU the threads that share the work of an op, those of the

@@ -13,9 +13,12 @@ const FRESH: Duration = Duration::from_secs(1);
 /// What needs more than this share of the memory left is worth measuring again.
 #[cfg(feature = "cpu")]
 const LARGE_SHARE: u64 = 4;
+/// A share of the memory left is not counted on: what lies between large allocations may be too small for the next.
+#[cfg(feature = "cpu")]
+const SLACK_SHARE: u64 = 8;
 /// Left alone for everything else that allocates meanwhile.
 #[cfg(feature = "cpu")]
-const RESERVE: u64 = 64 << 20;
+const RESERVE: u64 = 128 << 20;
 
 /// Bytes that this process can still allocate: the least of what the system has left, of what the control groups it is in
 /// may still use, and of what its own limits (`ulimit -v`, `ulimit -d`) leave. None where the system does not say, which
@@ -29,14 +32,8 @@ pub fn available_memory() -> Option<u64> {
     let groups = proc("self/cgroup").unwrap_or_default();
     [
         kilobytes(&meminfo, "MemAvailable:"),
-        left(
-            limit(&limits, "Max address space"),
-            kilobytes(&status, "VmSize:"),
-        ),
-        left(
-            limit(&limits, "Max data size"),
-            kilobytes(&status, "VmData:"),
-        ),
+        left(limit(&limits, "Max address space"), mapped(&status)),
+        left(limit(&limits, "Max data size"), mapped(&status)),
         left_in_groups(&groups, &read),
     ]
     .into_iter()
@@ -44,7 +41,7 @@ pub fn available_memory() -> Option<u64> {
     .min()
 }
 
-/// The memory left, if `needed` bytes are more than that. What needs little of it does not measure anew every time.
+/// The memory left, if `needed` bytes are more than that, or nearly so. What needs little of it does not measure anew every time.
 #[cfg(feature = "cpu")]
 pub(crate) fn lacking(needed: u64) -> Option<u64> {
     static LAST: Mutex<Option<(Instant, Option<u64>)>> = Mutex::new(None);
@@ -56,7 +53,7 @@ pub(crate) fn lacking(needed: u64) -> Option<u64> {
     if known.is_none() {
         *last = Some((Instant::now(), left));
     }
-    left.filter(|left| needed > left.saturating_sub(RESERVE))
+    left.filter(|left| needed > (left - left / SLACK_SHARE).saturating_sub(RESERVE))
 }
 
 /// A size for messages.
@@ -66,6 +63,13 @@ pub(crate) fn in_units(bytes: u64) -> String {
         bytes if bytes >= 1e9 => format!("{:.1} GB", bytes / 1e9),
         bytes => format!("{:.0} MB", bytes / 1e6),
     }
+}
+
+/// Address space of a process that is in use, from its `status`. `VmSize` and `VmData` have more: what an allocator has
+/// reserved for itself and not touched, which it will hand out.
+fn mapped(status: &str) -> Option<u64> {
+    let parts = ["RssAnon:", "VmStk:", "VmExe:", "VmLib:"];
+    parts.iter().map(|part| kilobytes(status, part)).sum()
 }
 
 fn left(limit: Option<u64>, used: Option<u64>) -> Option<u64> {
@@ -144,9 +148,10 @@ mod tests {
                       Max address space         1536000000           unlimited            bytes     \n";
         assert_eq!(limit(limits, "Max address space"), Some(1_536_000_000));
         assert_eq!(limit(limits, "Max data size"), None);
-        let status = "VmPeak:\t 7 kB\nVmSize:\t  101200 kB\n";
-        assert_eq!(kilobytes(status, "VmSize:"), Some(101_200 * 1024));
-        assert_eq!(kilobytes(status, "VmData:"), None);
+        let status =
+            "VmSize:\t 99 kB\nRssAnon:\t 1200 kB\nVmStk:\t 30 kB\nVmExe:\t 4 kB\nVmLib:\t 100 kB\n";
+        assert_eq!(mapped(status), Some(1_334 * 1024));
+        assert_eq!(mapped("RssAnon:\t 1200 kB\n"), None);
         assert_eq!(left(Some(5), Some(7)), Some(0));
     }
 

@@ -4,6 +4,7 @@ use burn::tensor::{Device, Tensor};
 use serde::Serialize;
 use splat_model::losses::{SsimSettings, psnr, ssim};
 use splat_model::ops::OpError;
+use splat_model::ops::device::to_host;
 use splat_model::{Gaussians, RenderSettings, render};
 
 use crate::capture::View;
@@ -35,7 +36,7 @@ pub struct Scores {
 /// `H x W x 3` values clamped to [0, 1], for whoever keeps pictures.
 ///
 /// # Errors
-/// When an op refuses its input.
+/// When an op refuses its input, or the device fails.
 pub fn evaluate(
     gaussians: &Gaussians,
     views: &[&View],
@@ -49,14 +50,15 @@ pub fn evaluate(
         let rendered = render(gaussians, &camera.tensors(device), settings)?;
         let image = rendered.image().clamp(0.0, 1.0);
         let target = photo(view, device);
-        let scalar = |value: Tensor<1>| f64::from(value.into_scalar::<f32>());
+        let scalar = |value: Tensor<1>| -> Result<f64, OpError> {
+            Ok(to_host(value)?.first().copied().map_or(f64::NAN, f64::from))
+        };
         scores.push(ViewScore {
             name: view.name.clone(),
-            psnr: scalar(psnr(image.clone(), target.clone())),
-            ssim: scalar(ssim(image.clone(), target, &SsimSettings::default())?),
+            psnr: scalar(psnr(image.clone(), target.clone()))?,
+            ssim: scalar(ssim(image.clone(), target, &SsimSettings::default())?)?,
         });
-        let picture = image.into_data().convert::<f32>();
-        each(view, picture.try_into_vec().unwrap_or_default());
+        each(view, to_host(image)?);
     }
     Ok(Scores::of_views(scores))
 }

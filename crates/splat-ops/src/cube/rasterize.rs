@@ -6,7 +6,7 @@ use burn::tensor::{FloatDType, Shape};
 use burn_cubecl::CubeBackend;
 use burn_cubecl::tensor::CubeTensor;
 use cubecl::client::Client;
-use splat_kernels::intersect::{Frames, IntersectError, MAX_INSTANCES};
+use splat_kernels::intersect::{Frames, IntersectError};
 use splat_kernels::rasterize::{
     RasterizeInputs, RasterizeSettings, RasterizeState, Sums, count_evaluations, rasterize,
     rasterize_vjp,
@@ -78,10 +78,10 @@ impl Prepared {
 fn op_error(error: IntersectError) -> OpError {
     let op = "rasterize";
     match error {
-        IntersectError::TooManyInstances(pairs) => OpError::TooManyPairs {
+        IntersectError::TooManyInstances { count, limit } => OpError::TooManyPairs {
             op,
-            pairs,
-            limit: MAX_INSTANCES,
+            pairs: count,
+            limit,
         },
         IntersectError::Device(what) => OpError::Device { op, what },
     }

@@ -7,6 +7,7 @@ use std::path::PathBuf;
 
 use burn::tensor::Tensor;
 use clap::{Args, ValueEnum};
+use splat_model::ops::device::to_host;
 use splat_model::ops::{OpError, Projected, rasterize};
 use splat_model::{CameraTensors, Gaussians, RenderSettings, project_gaussians, render_projected};
 
@@ -119,11 +120,11 @@ fn pictures(
     let mut pictures = Vec::with_capacity(channels.len());
     for &channel in channels {
         let picture = match channel {
-            Channel::Rgb => Picture::from_rgb_f32(width, height, &host(rendered.image())),
-            Channel::Alpha => Picture::from_gray_f32(width, height, &host(rendered.alpha())),
+            Channel::Rgb => Picture::from_rgb_f32(width, height, &to_host(rendered.image())?),
+            Channel::Alpha => Picture::from_gray_f32(width, height, &to_host(rendered.alpha())?),
             Channel::Depth => {
                 let depth = accumulated_depth(gaussians, &projected, settings)?;
-                let shades = depth_shades(&host(depth), &host(rendered.alpha()));
+                let shades = depth_shades(&to_host(depth)?, &to_host(rendered.alpha())?);
                 Picture::from_gray_f32(width, height, &shades)
             }
         };
@@ -168,11 +169,6 @@ fn depth_shades(depth: &[f32], alpha: &[f32]) -> Vec<f32> {
 fn file_stem(name: &str) -> String {
     let stem = std::path::Path::new(name).with_extension("");
     stem.to_string_lossy().replace(['/', '\\', ':'], "_")
-}
-
-fn host<const R: usize>(tensor: Tensor<R>) -> Vec<f32> {
-    let data = tensor.into_data().convert::<f32>();
-    data.try_into_vec().unwrap_or_default()
 }
 
 #[cfg(test)]
