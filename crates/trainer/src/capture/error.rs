@@ -127,13 +127,50 @@ pub enum CaptureError {
         /// The points file.
         path: PathBuf,
     },
+    /// The folder given for the photos is not there.
+    #[error(
+        "{}: no such folder of photos (--images); give it relative to the capture, or whole{}",
+        path.display(),
+        elsewhere.as_ref().map_or_else(String::new, |folder| {
+            format!("; photos of the model are in `{}`", folder.display())
+        })
+    )]
+    NoPhotoFolder {
+        /// The folder.
+        path: PathBuf,
+        /// Another folder of the capture that holds photos of the model, relative to the capture.
+        elsewhere: Option<PathBuf>,
+    },
     /// The photo of an image of the model is not there.
-    #[error("{}: no such photo, but the model names the image `{image}`; restore it or remove it from the model", path.display())]
+    #[error(
+        "{}: no such photo, but the model names the image `{image}`; {}",
+        path.display(),
+        match elsewhere {
+            None => "restore it or remove it from the model".to_owned(),
+            Some((folder, count)) => format!(
+                "{count} photo(s) of the model are in the folder `{}`, which can be named with --images",
+                folder.display()
+            ),
+        }
+    )]
     MissingPhoto {
         /// Where the photo should be.
         path: PathBuf,
         /// Name of the image in the model.
         image: String,
+        /// Another folder of the capture, relative to it, that holds more photos of the model, and how many.
+        elsewhere: Option<(PathBuf, usize)>,
+    },
+    /// A photo of which a part is missing, which decoders make up.
+    #[error(
+        "{}: {reason}; the rest would be made up: restore the photo, or remove its image from the model",
+        path.display()
+    )]
+    IncompletePhoto {
+        /// The photo.
+        path: PathBuf,
+        /// What is missing.
+        reason: String,
     },
     /// A photo that cannot be decoded.
     #[error("{}: cannot be decoded as JPEG or PNG: {reason}", path.display())]
