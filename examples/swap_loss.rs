@@ -19,7 +19,13 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args().skip(1);
     let folder = arguments.next().unwrap_or("examples/data/saharov".into());
     let steps = arguments.next().map_or(Ok(300), |steps| steps.parse())?;
-    let capture = Capture::load(folder.as_ref(), &CaptureOptions { downscale: 2 })?;
+    let capture = Capture::load(
+        folder.as_ref(),
+        &CaptureOptions {
+            downscale: 2,
+            ..CaptureOptions::default()
+        },
+    )?;
     let config = TrainConfig {
         steps,
         ..TrainConfig::default()

@@ -9,6 +9,7 @@ pub mod gradcheck;
 #[cfg(feature = "cpu")]
 pub mod performance;
 pub mod report;
+mod text;
 pub mod train;
 
 pub use capture::{Capture, CaptureOptions};

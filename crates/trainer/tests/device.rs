@@ -34,7 +34,14 @@ const STEPS: usize = 24;
 /// The example capture at 20 x 30 pixels, with one in forty of its points.
 fn capture() -> Arc<Capture> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
-    let mut capture = Capture::load(&folder, &CaptureOptions { downscale: 16 }).unwrap();
+    let mut capture = Capture::load(
+        &folder,
+        &CaptureOptions {
+            downscale: 16,
+            ..CaptureOptions::default()
+        },
+    )
+    .unwrap();
     capture.points = capture.points.into_iter().step_by(40).collect();
     Arc::new(capture)
 }

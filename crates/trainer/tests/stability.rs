@@ -17,7 +17,14 @@ const SPOILED: usize = 5;
 
 fn load(downscale: u32) -> Capture {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
-    Capture::load(&folder, &CaptureOptions { downscale }).unwrap()
+    Capture::load(
+        &folder,
+        &CaptureOptions {
+            downscale,
+            ..CaptureOptions::default()
+        },
+    )
+    .unwrap()
 }
 
 /// The example capture at 59 x 39 pixels, with a tenth of its points.

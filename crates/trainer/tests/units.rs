@@ -15,7 +15,11 @@ const UNITS: [f64; 6] = [1e-6, 0.002, 0.37, 25.4, 1e3, 1e6];
 /// The example capture at 118 x 79 pixels in a unit that is `1 / unit` times as large.
 fn capture(unit: f64) -> Arc<Capture> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
-    let mut capture = Capture::load(&folder, &CaptureOptions { downscale: 4 }).unwrap();
+    let options = CaptureOptions {
+        downscale: 4,
+        ..CaptureOptions::default()
+    };
+    let mut capture = Capture::load(&folder, &options).unwrap();
     for view in &mut capture.views {
         for row in &mut view.viewmat[..3] {
             row[3] *= unit;

@@ -7,6 +7,7 @@ use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
 use super::{CaptureError, CaptureWarning, Point, colmap_binary, colmap_text};
+use crate::text::Excerpt;
 
 /// A sparse model as read and checked: every number finite, every image's camera present, at least one image and
 /// one point.
@@ -113,9 +114,12 @@ pub(super) fn pinhole_intrinsics(parameters: &[f64]) -> [f64; 4] {
     }
 }
 
+/// Bytes of the longest path that systems take.
+const MOST_NAME: usize = 4096;
+
 /// Finds the model of the capture in `root`, reads and checks it.
 pub(super) fn read(root: &Path) -> Result<(SparseModel, Vec<CaptureWarning>), CaptureError> {
-    let (folder, warnings) = find_folder(root)?;
+    let (folder, mut warnings) = find_folder(root)?;
     let files = ModelFiles::find(&folder)?;
     let (cameras, images, points) = if files.binary {
         (
@@ -124,14 +128,30 @@ pub(super) fn read(root: &Path) -> Result<(SparseModel, Vec<CaptureWarning>), Ca
             colmap_binary::read_points(&files.points)?,
         )
     } else {
-        (
-            colmap_text::read_cameras(&files.cameras)?,
-            colmap_text::read_images(&files.images)?,
-            colmap_text::read_points(&files.points)?,
-        )
+        read_text(&files, &mut warnings)?
     };
     let model = assemble(&files, cameras, images, points)?;
     Ok((model, warnings))
+}
+
+type Lists = (Vec<Camera>, Vec<Image>, Vec<Point>);
+
+fn read_text(
+    files: &ModelFiles,
+    warnings: &mut Vec<CaptureWarning>,
+) -> Result<Lists, CaptureError> {
+    let [cameras, images, points] = [&files.cameras, &files.images, &files.points];
+    let text = colmap_text::read_file(cameras)?;
+    let read_cameras = colmap_text::parse_cameras(cameras, &text)?;
+    let text = colmap_text::read_file(images)?;
+    let read_images = colmap_text::parse_images(images, &text)?;
+    let text = colmap_text::read_file(points)?;
+    let read_points = colmap_text::parse_points(points, &text)?;
+    Ok((
+        read_cameras.checked(cameras, "cameras", warnings),
+        read_images.checked(images, "images", warnings),
+        read_points.checked(points, "points", warnings),
+    ))
 }
 
 /// The folder that holds the model.
@@ -232,12 +252,15 @@ fn assemble(
 ) -> Result<SparseModel, CaptureError> {
     let mut by_id = HashMap::with_capacity(cameras.len());
     for camera in cameras {
-        check_camera(&camera).map_err(|reason| CaptureError::BadRecord {
+        let bad = |reason| CaptureError::BadRecord {
             path: files.cameras.clone(),
             record: format!("camera {}", camera.id),
             reason,
-        })?;
-        by_id.insert(camera.id, camera);
+        };
+        check_camera(&camera).map_err(bad)?;
+        if by_id.insert(camera.id, camera).is_some() {
+            return Err(bad("its id occurs twice".to_owned()));
+        }
     }
 
     if images.is_empty() {
@@ -250,7 +273,7 @@ fn assemble(
         let unique = names.insert(image.name.as_str());
         check_image(image, &by_id, unique).map_err(|reason| CaptureError::BadRecord {
             path: files.images.clone(),
-            record: format!("image {} (`{}`)", image.id, image.name),
+            record: format!("image {} (`{}`)", image.id, Excerpt(&image.name)),
             reason,
         })?;
     }
@@ -295,6 +318,10 @@ fn check_camera(camera: &Camera) -> Result<(), String> {
 fn check_image(image: &Image, cameras: &HashMap<u32, Camera>, unique: bool) -> Result<(), String> {
     if !unique {
         return Err("its name occurs twice".to_owned());
+    }
+    let is_odd = |c: char| c.is_control() && c != '\t';
+    if image.name.chars().any(is_odd) || image.name.len() > MOST_NAME {
+        return Err("its name is no file's name".to_owned());
     }
     if !cameras.contains_key(&image.camera_id) {
         return Err(format!(

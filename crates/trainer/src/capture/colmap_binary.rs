@@ -124,7 +124,7 @@ impl<'a> Reader<'a> {
         Self { path, rest: bytes }
     }
 
-    /// Reads a count and then that many records.
+    /// Reads a count and then that many records, with which the file must end.
     fn records<T>(
         &mut self,
         kind: &'static str,
@@ -133,9 +133,18 @@ impl<'a> Reader<'a> {
         mut read: impl FnMut(&mut Self, Record) -> Result<T, CaptureError>,
     ) -> Result<Vec<T>, CaptureError> {
         let count = self.list_len(FILE, kinds, min_size)?;
-        (0..count)
+        let records = (0..count)
             .map(|index| read(self, Record { kind, index, count }))
-            .collect()
+            .collect::<Result<_, _>>()?;
+        if !self.rest.is_empty() {
+            return Err(CaptureError::LeftOver {
+                path: self.path.to_path_buf(),
+                count,
+                what: kinds,
+                remaining: self.rest.len(),
+            });
+        }
+        Ok(records)
     }
 
     fn take<const N: usize>(

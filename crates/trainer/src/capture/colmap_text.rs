@@ -1,120 +1,277 @@
 //! COLMAP's text files: one record a line (two for an image), fields separated by blanks, `#` starts a comment line.
+//!
+//! Comments may be in any encoding; a record must be UTF-8, since a name in another is no file's name. What is read takes
+//! less than 32 times the memory of the file.
 
 use std::path::Path;
-use std::str::{FromStr, SplitWhitespace};
+use std::str::{FromStr, SplitAsciiWhitespace};
 
 use super::colmap::{Camera, Image, pinhole_intrinsics, pinhole_parameters};
-use super::{CaptureError, Point};
+use super::{CaptureError, CaptureWarning, Point};
+use crate::text::{Excerpt, lines, without_mark};
 
-/// Reads `cameras.txt`: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`.
-pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>, CaptureError> {
-    let text = read_file(path)?;
-    records(&text)
-        .map(|(line, record)| {
-            let mut fields = Fields::new(path, line, record);
-            let id = fields.next("camera id")?;
-            let model: String = fields.next("model")?;
-            let Some(parameters) = pinhole_parameters(&model) else {
-                return Err(CaptureError::UnsupportedCamera {
-                    path: path.to_path_buf(),
-                    camera_id: id,
-                    model,
-                });
-            };
-            let width = fields.next("width")?;
-            let height = fields.next("height")?;
-            let mut values = [0.0; 4];
-            for value in &mut values[..parameters] {
-                *value = fields.next("parameters")?;
-            }
-            Ok(Camera {
-                id,
-                width,
-                height,
-                intrinsics: pinhole_intrinsics(&values[..parameters]),
-            })
-        })
-        .collect()
+/// What a file lists, and how many of it the comments at its head announce.
+#[derive(Debug)]
+pub(super) struct Listed<T> {
+    pub records: Vec<T>,
+    pub announced: Option<u64>,
 }
 
-/// Reads `images.txt`: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, then a line of keypoints, which may be empty
-/// and is skipped. The name runs to the end of its line, blanks included.
-pub(super) fn read_images(path: &Path) -> Result<Vec<Image>, CaptureError> {
-    let text = read_file(path)?;
-    let mut lines = text.lines().enumerate();
-    let mut images = Vec::new();
-    while let Some((line, record)) = lines.next() {
-        if !is_record(record) {
-            continue;
+impl<T> Listed<T> {
+    /// The records; a warning if they are not as many as announced. `what` they are is said in the plural.
+    pub fn checked(
+        self,
+        path: &Path,
+        what: &'static str,
+        warnings: &mut Vec<CaptureWarning>,
+    ) -> Vec<T> {
+        let read = self.records.len();
+        if let Some(announced) = self.announced.filter(|&count| count != read as u64) {
+            warnings.push(CaptureWarning::Miscounted {
+                path: path.to_path_buf(),
+                what,
+                announced,
+                read,
+            });
         }
-        let mut fields = Fields::new(path, line, record);
-        let id = fields.next("image id")?;
-        let quaternion = fields.array("quaternion")?;
-        let translation = fields.array("translation")?;
-        let camera_id = fields.next("camera id")?;
-        // Nine fields precede the name; splitting again keeps the blanks inside it.
-        let name = nth_field_onwards(record, 9);
-        if name.is_empty() {
-            return Err(fields.error("its name is missing"));
-        }
-        images.push(Image {
-            id,
-            camera_id,
-            name: name.to_owned(),
-            quaternion,
-            translation,
-        });
-        lines.next();
+        self.records
     }
-    Ok(images)
 }
 
-/// Reads `points3D.txt`: `POINT3D_ID X Y Z R G B ERROR TRACK[]`; the track is skipped.
-pub(super) fn read_points(path: &Path) -> Result<Vec<Point>, CaptureError> {
-    let text = read_file(path)?;
-    records(&text)
-        .map(|(line, record)| {
-            let mut fields = Fields::new(path, line, record);
-            let _id: u64 = fields.next("point id")?;
-            let position = fields.array("position")?;
-            let color = fields.array("colour")?;
-            Ok(Point { position, color })
-        })
-        .collect()
-}
-
-fn read_file(path: &Path) -> Result<String, CaptureError> {
-    std::fs::read_to_string(path).map_err(|source| CaptureError::Io {
+/// Reads a file whole.
+pub(super) fn read_file(path: &Path) -> Result<Vec<u8>, CaptureError> {
+    std::fs::read(path).map_err(|source| CaptureError::Io {
         path: path.to_path_buf(),
         source,
     })
 }
 
-fn is_record(line: &str) -> bool {
-    let line = line.trim_start();
-    !line.is_empty() && !line.starts_with('#')
+/// Parses `cameras.txt`: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`. `path` is for messages.
+pub(super) fn parse_cameras(path: &Path, text: &[u8]) -> Result<Listed<Camera>, CaptureError> {
+    let file = File::new(path, text)?;
+    let camera = |mut fields: Fields<'_>| {
+        let id = fields.next("camera id")?;
+        let model: String = fields.next("model")?;
+        let Some(parameters) = pinhole_parameters(&model) else {
+            return Err(CaptureError::UnsupportedCamera {
+                path: path.to_path_buf(),
+                camera_id: id,
+                model: Excerpt(&model).to_string(),
+            });
+        };
+        let width = fields.next("width")?;
+        let height = fields.next("height")?;
+        let mut values = [0.0; 4];
+        for value in &mut values[..parameters] {
+            *value = fields.next("parameters")?;
+        }
+        if fields.fields.next().is_some() {
+            let reason = format!("it has more than the {parameters} parameters of {model}");
+            return Err(fields.error(&reason));
+        }
+        Ok(Camera {
+            id,
+            width,
+            height,
+            intrinsics: pinhole_intrinsics(&values[..parameters]),
+        })
+    };
+    Ok(Listed {
+        records: file
+            .records()
+            .map(|fields| camera(fields?))
+            .collect::<Result<_, _>>()?,
+        announced: file.announced("cameras"),
+    })
 }
 
-/// Lines with a record, with their index from 0.
-fn records(text: &str) -> impl Iterator<Item = (usize, &str)> {
-    text.lines().enumerate().filter(|(_, line)| is_record(line))
+/// Parses `images.txt`: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, and then a line of keypoints, `X Y POINT3D_ID` any
+/// number of times, which is skipped. The name runs to the end of its line, blanks included. `path` is for messages.
+///
+/// The line of keypoints may be empty, and programs leave it out where there are none. So each line is taken for what it
+/// can be: keypoints are numbers only, three by three, which an image with a name is not. A line that could be either (a
+/// name of nothing but numbers, or keypoints that count like ids) is keypoints if it follows an image.
+pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<Image>, CaptureError> {
+    /// What the last line with anything on it, and an empty one after it, leave open.
+    #[derive(PartialEq)]
+    enum Next {
+        Keypoints,
+        Either,
+        Image,
+    }
+    let file = File::new(path, text)?;
+    let mut records = Vec::new();
+    let mut next = Next::Image;
+    for fields in file.lines() {
+        let fields = fields?;
+        if fields.record.is_empty() {
+            if next == Next::Keypoints {
+                next = Next::Either;
+            }
+            continue;
+        }
+        let image = image(fields.clone());
+        let keypoints = are_keypoints(fields.record, image.is_ok());
+        match (image, keypoints) {
+            (Err(_), true) if next != Next::Image => next = Next::Image,
+            (Ok(_), true) if next == Next::Keypoints => next = Next::Image,
+            (Ok(image), _) => {
+                records.push(image);
+                next = Next::Keypoints;
+            }
+            (Err(reason), keypoints) => {
+                let taken_for = if keypoints {
+                    "keypoints that follow no image, or a damaged image"
+                } else {
+                    "neither an image nor the keypoints of one"
+                };
+                return Err(fields.error(&format!("{taken_for}: {reason}")));
+            }
+        }
+    }
+    Ok(Listed {
+        records,
+        announced: file.announced("images"),
+    })
+}
+
+/// The image of a line, or what is wrong with it.
+fn image(mut fields: Fields<'_>) -> Result<Image, String> {
+    let id = fields.parsed("image id")?;
+    let quaternion = fields.parsed_array("quaternion")?;
+    let translation = fields.parsed_array("translation")?;
+    let camera_id = fields.parsed("camera id")?;
+    // Nine fields precede the name; splitting again keeps the blanks inside it.
+    let name = nth_field_onwards(fields.record, 9);
+    if name.is_empty() {
+        return Err("its name is missing".to_owned());
+    }
+    Ok(Image {
+        id,
+        camera_id,
+        name: name.to_owned(),
+        quaternion,
+        translation,
+    })
+}
+
+/// Whether a line is numbers only, three by three. Where it might be an `image` too, every third must be whole, as ids are.
+fn are_keypoints(line: &str, image: bool) -> bool {
+    let is_number = |field: &str| {
+        // Cheaper than parsing, and as good where nothing else fits the line.
+        let plain = |byte: u8| byte.is_ascii_digit() || b"+-.eE".contains(&byte);
+        !image && field.bytes().all(plain) || field.parse::<f64>().is_ok()
+    };
+    let is_whole = |field: &str| field.parse::<f64>().is_ok_and(|value| value.fract() == 0.0);
+    let mut count = 0;
+    for field in line.split_ascii_whitespace() {
+        count += 1;
+        if !is_number(field) || image && count % 3 == 0 && !is_whole(field) {
+            return false;
+        }
+    }
+    count % 3 == 0
+}
+
+/// Parses `points3D.txt`: `POINT3D_ID X Y Z R G B ERROR TRACK[]`; the track, pairs of an image id and a keypoint's index, is
+/// skipped, and may be left out with the error. `path` is for messages.
+pub(super) fn parse_points(path: &Path, text: &[u8]) -> Result<Listed<Point>, CaptureError> {
+    let file = File::new(path, text)?;
+    let point = |mut fields: Fields<'_>| {
+        let _id: u64 = fields.next("point id")?;
+        let position = fields.array("position")?;
+        let color = fields.array("colour")?;
+        if fields.fields.clone().next().is_some() {
+            let _: f64 = fields.next("error")?;
+        }
+        if !fields.fields.clone().count().is_multiple_of(2) {
+            return Err(fields.error("its track is no list of pairs; is the line cut off?"));
+        }
+        Ok(Point { position, color })
+    };
+    Ok(Listed {
+        records: file
+            .records()
+            .map(|fields| point(fields?))
+            .collect::<Result<_, _>>()?,
+        announced: file.announced("points"),
+    })
 }
 
 /// What is left of `line` after its first `count` fields, trimmed.
 fn nth_field_onwards(line: &str, count: usize) -> &str {
     (0..count)
-        .fold(line.trim_start(), |rest, _| {
-            let end = rest.find(char::is_whitespace).unwrap_or(rest.len());
-            rest[end..].trim_start()
+        .fold(line.trim_ascii_start(), |rest, _| {
+            let end = rest.find(|c: char| c.is_ascii_whitespace());
+            rest[end.unwrap_or(rest.len())..].trim_ascii_start()
         })
-        .trim_end()
+        .trim_ascii_end()
+}
+
+/// A text file in memory.
+struct File<'a> {
+    path: &'a Path,
+    text: &'a [u8],
+}
+
+impl<'a> File<'a> {
+    fn new(path: &'a Path, bytes: &'a [u8]) -> Result<Self, CaptureError> {
+        let text = without_mark(bytes).map_err(|reason| CaptureError::NotText {
+            path: path.to_path_buf(),
+            reason,
+        })?;
+        Ok(Self { path, text })
+    }
+
+    /// Lines that are no comment, empty ones too.
+    fn lines(&self) -> impl Iterator<Item = Result<Fields<'a>, CaptureError>> {
+        let path = self.path;
+        let lines = lines(self.text).filter(|(_, line)| !line.starts_with(b"#"));
+        lines.map(move |(line, bytes)| match std::str::from_utf8(bytes) {
+            Ok(record) => Ok(Fields::new(path, line, record)),
+            Err(error) => {
+                let from = bytes[..error.valid_up_to()]
+                    .iter()
+                    .rposition(u8::is_ascii_whitespace);
+                let odd = bytes[from.map_or(0, |at| at + 1)..].escape_ascii();
+                let odd: String = odd.take(80).map(char::from).collect();
+                let reason = format!("`{odd}` is not UTF-8 text; save the file as UTF-8");
+                Err(Fields::new(path, line, "").error(&reason))
+            }
+        })
+    }
+
+    /// Lines with a record.
+    fn records(&self) -> impl Iterator<Item = Result<Fields<'a>, CaptureError>> {
+        let is_record = |fields: &Result<Fields<'_>, _>| match fields {
+            Ok(fields) => !fields.record.is_empty(),
+            Err(_) => true,
+        };
+        self.lines().filter(is_record)
+    }
+
+    /// The number in the first comment like `# Number of images: 15, mean observations per image: 812`.
+    fn announced(&self, what: &str) -> Option<u64> {
+        let mut comments = lines(self.text).filter(|(_, line)| line.starts_with(b"#"));
+        comments.find_map(|(_, line)| {
+            let line = String::from_utf8_lossy(line).to_ascii_lowercase();
+            let (_, rest) = line.split_once(&format!("number of {what}:"))?;
+            let rest = rest.trim_ascii_start();
+            let end = rest
+                .find(|c: char| !c.is_ascii_digit())
+                .unwrap_or(rest.len());
+            rest[..end].parse().ok()
+        })
+    }
 }
 
 /// The fields of one line.
+#[derive(Clone)]
 struct Fields<'a> {
     path: &'a Path,
     line: usize,
-    fields: SplitWhitespace<'a>,
+    record: &'a str,
+    fields: SplitAsciiWhitespace<'a>,
 }
 
 impl<'a> Fields<'a> {
@@ -122,26 +279,39 @@ impl<'a> Fields<'a> {
         Self {
             path,
             line,
-            fields: record.split_whitespace(),
+            record,
+            fields: record.split_ascii_whitespace(),
         }
     }
 
     fn next<T: FromStr>(&mut self, field: &str) -> Result<T, CaptureError> {
-        let Some(value) = self.fields.next() else {
-            return Err(self.error(&format!("its {field} is missing")));
-        };
-        value
-            .parse()
-            .map_err(|_| self.error(&format!("its {field} `{value}` cannot be read")))
+        self.parsed(field).map_err(|reason| self.error(&reason))
     }
 
     fn array<T: FromStr + Copy + Default, const N: usize>(
         &mut self,
         field: &str,
     ) -> Result<[T; N], CaptureError> {
+        self.parsed_array(field)
+            .map_err(|reason| self.error(&reason))
+    }
+
+    /// The next field, or what is wrong with it.
+    fn parsed<T: FromStr>(&mut self, field: &str) -> Result<T, String> {
+        let Some(value) = self.fields.next() else {
+            return Err(format!("its {field} is missing"));
+        };
+        let unreadable = |_| format!("its {field} `{}` cannot be read", Excerpt(value));
+        value.parse().map_err(unreadable)
+    }
+
+    fn parsed_array<T: FromStr + Copy + Default, const N: usize>(
+        &mut self,
+        field: &str,
+    ) -> Result<[T; N], String> {
         let mut values = [T::default(); N];
         for value in &mut values {
-            *value = self.next(field)?;
+            *value = self.parsed(field)?;
         }
         Ok(values)
     }
@@ -154,3 +324,6 @@ impl<'a> Fields<'a> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

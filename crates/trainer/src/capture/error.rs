@@ -66,6 +66,29 @@ pub enum CaptureError {
         /// Bytes left in the file.
         remaining: usize,
     },
+    /// A binary file that goes on after its last record.
+    #[error(
+        "{}: {remaining} bytes follow the {count} {what} that the file announces; it is damaged, or its count is wrong",
+        path.display()
+    )]
+    LeftOver {
+        /// The file.
+        path: PathBuf,
+        /// The count at its start.
+        count: usize,
+        /// What is counted.
+        what: &'static str,
+        /// Bytes left in the file.
+        remaining: usize,
+    },
+    /// A text file in an encoding that is not read.
+    #[error("{}: {reason}", path.display())]
+    NotText {
+        /// The file.
+        path: PathBuf,
+        /// What it is instead, and what to do.
+        reason: &'static str,
+    },
     /// A record that cannot be understood or makes no sense.
     #[error("{}: {record}: {reason}", path.display())]
     BadRecord {
@@ -104,13 +127,50 @@ pub enum CaptureError {
         /// The points file.
         path: PathBuf,
     },
+    /// The folder given for the photos is not there.
+    #[error(
+        "{}: no such folder of photos (--images); give it relative to the capture, or whole{}",
+        path.display(),
+        elsewhere.as_ref().map_or_else(String::new, |folder| {
+            format!("; photos of the model are in `{}`", folder.display())
+        })
+    )]
+    NoPhotoFolder {
+        /// The folder.
+        path: PathBuf,
+        /// Another folder of the capture that holds photos of the model, relative to the capture.
+        elsewhere: Option<PathBuf>,
+    },
     /// The photo of an image of the model is not there.
-    #[error("{}: no such photo, but the model names the image `{image}`; restore it or remove it from the model", path.display())]
+    #[error(
+        "{}: no such photo, but the model names the image `{image}`; {}",
+        path.display(),
+        match elsewhere {
+            None => "restore it or remove it from the model".to_owned(),
+            Some((folder, count)) => format!(
+                "{count} photo(s) of the model are in the folder `{}`, which can be named with --images",
+                folder.display()
+            ),
+        }
+    )]
     MissingPhoto {
         /// Where the photo should be.
         path: PathBuf,
         /// Name of the image in the model.
         image: String,
+        /// Another folder of the capture, relative to it, that holds more photos of the model, and how many.
+        elsewhere: Option<(PathBuf, usize)>,
+    },
+    /// A photo of which a part is missing, which decoders make up.
+    #[error(
+        "{}: {reason}; the rest would be made up: restore the photo, or remove its image from the model",
+        path.display()
+    )]
+    IncompletePhoto {
+        /// The photo.
+        path: PathBuf,
+        /// What is missing.
+        reason: String,
     },
     /// A photo that cannot be decoded.
     #[error("{}: cannot be decoded as JPEG or PNG: {reason}", path.display())]
@@ -202,6 +262,24 @@ pub enum CaptureWarning {
         /// The first of them.
         first: String,
     },
+    /// A text file of the model lists more or less than its comments announce.
+    Miscounted {
+        /// The file.
+        path: PathBuf,
+        /// What it lists.
+        what: &'static str,
+        /// The number in the comments.
+        announced: u64,
+        /// The number of records.
+        read: usize,
+    },
+    /// JPEG files with more data than their picture takes, or less detail than they were begun with.
+    DamagedPhotos {
+        /// Number of such photos.
+        count: usize,
+        /// The first of them.
+        first: String,
+    },
     /// Photos in the folder that the model does not name; they are not used.
     UnregisteredPhotos {
         /// Number of such photos.
@@ -248,6 +326,20 @@ impl fmt::Display for CaptureWarning {
             Self::TransparentPhotos { count, first } => write!(
                 f,
                 "{count} photo(s) have transparent pixels, from `{first}`; they were put on black"
+            ),
+            Self::Miscounted {
+                path,
+                what,
+                announced,
+                read,
+            } => write!(
+                f,
+                "{}: its comments announce {announced} {what}, but it lists {read}; the file may be cut off, or was edited",
+                path.display()
+            ),
+            Self::DamagedPhotos { count, first } => write!(
+                f,
+                "{count} photo(s) hold more or less data than their picture takes and are likely damaged, from `{first}`; look at them"
             ),
             Self::UnregisteredPhotos { count, first } => write!(
                 f,

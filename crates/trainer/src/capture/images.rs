@@ -1,14 +1,16 @@
 //! Photos: found, decoded once and in parallel, fitted to their cameras, kept as 8-bit RGB.
 
-use std::collections::HashSet;
-use std::path::{Path, PathBuf};
+mod folders;
+
+use std::io::Cursor;
+use std::path::Path;
 use std::sync::Arc;
 
-use image::DynamicImage;
+use image::{DynamicImage, ImageError, ImageFormat, ImageReader};
 use rayon::prelude::*;
 
 use super::colmap::{Camera, Image, SparseModel};
-use super::{CaptureError, CaptureWarning, View, downscale};
+use super::{CaptureError, CaptureOptions, CaptureWarning, View, downscale, jpeg};
 
 /// Least width and height of a photo: the window of SSIM.
 pub(super) const MIN_SIDE: u32 = 11;
@@ -17,10 +19,10 @@ pub(super) const MIN_SIDE: u32 = 11;
 pub(super) fn load(
     root: &Path,
     model: &SparseModel,
-    factor: u32,
+    options: &CaptureOptions,
     warnings: &mut Vec<CaptureWarning>,
 ) -> Result<Vec<View>, CaptureError> {
-    let folder = photo_folder(root);
+    let folder = folders::of_photos(root, options.images.as_deref(), model)?;
     // Look for every photo before decoding any: the likeliest mistake is found at once.
     for image in &model.images {
         let path = folder.join(&image.name);
@@ -28,9 +30,11 @@ pub(super) fn load(
             return Err(CaptureError::MissingPhoto {
                 path,
                 image: image.name.clone(),
+                elsewhere: folders::elsewhere(root, &folder, model),
             });
         }
     }
+    let factor = options.downscale;
     let loaded: Vec<Result<Loaded, CaptureError>> = model
         .images
         .par_iter()
@@ -39,24 +43,17 @@ pub(super) fn load(
     let loaded = loaded.into_iter().collect::<Result<Vec<_>, _>>()?;
     warnings.extend(rescaled(&loaded));
     warnings.extend(transparent(&loaded));
-    warnings.extend(unregistered(root, model));
+    warnings.extend(damaged(&loaded));
+    warnings.extend(folders::unregistered(root, &folder, model));
     Ok(loaded.into_iter().map(|loaded| loaded.view).collect())
-}
-
-/// `images/` in the capture, or the capture itself if there is no such folder.
-fn photo_folder(root: &Path) -> PathBuf {
-    let images = root.join("images");
-    if images.is_dir() {
-        images
-    } else {
-        root.to_path_buf()
-    }
 }
 
 /// A view and what was odd about its photo.
 struct Loaded {
     view: View,
     transparent: bool,
+    /// Whether its file is likely damaged, though its picture is whole.
+    suspect: bool,
     /// Sizes of photo and camera where they differ.
     rescaled: Option<[[u32; 2]; 2]>,
 }
@@ -68,8 +65,8 @@ fn load_one(
     factor: u32,
 ) -> Result<Loaded, CaptureError> {
     let path = folder.join(&image.name);
-    let photo = decode(&path)?;
-    let size = [photo.width(), photo.height()];
+    let mut file = PhotoFile::open(&path)?;
+    let size = file.size(&path)?;
     let camera_size = [camera.width, camera.height];
     let Some(mut intrinsics) = fit_intrinsics(camera, size) else {
         return Err(CaptureError::PhotoSize {
@@ -79,6 +76,8 @@ fn load_one(
             camera: camera_size,
         });
     };
+    let suspect = file.check_whole(&path)?;
+    let photo = file.decode(&path)?;
 
     let (mut pixels, transparent) = opaque_rgb(photo);
     let [mut width, mut height] = size;
@@ -104,25 +103,68 @@ fn load_one(
             image: Arc::new(pixels),
         },
         transparent,
+        suspect,
         rescaled: (size != camera_size).then_some([size, camera_size]),
     })
 }
 
-/// Decodes a photo as stored: like COLMAP, without turning it by its EXIF orientation.
-fn decode(path: &Path) -> Result<DynamicImage, CaptureError> {
-    let io_error = |source| CaptureError::Io {
-        path: path.to_path_buf(),
-        source,
-    };
-    image::ImageReader::open(path)
-        .map_err(io_error)?
-        .with_guessed_format()
-        .map_err(io_error)?
-        .decode()
-        .map_err(|error| CaptureError::UndecodablePhoto {
+/// A photo's file in memory.
+struct PhotoFile {
+    bytes: Vec<u8>,
+    format: ImageFormat,
+}
+
+impl PhotoFile {
+    fn open(path: &Path) -> Result<Self, CaptureError> {
+        let bytes = std::fs::read(path).map_err(|source| CaptureError::Io {
             path: path.to_path_buf(),
-            reason: error.to_string().replace('\n', " "),
-        })
+            source,
+        })?;
+        let format = image::guess_format(&bytes).map_err(|error| undecodable(path, &error))?;
+        Ok(Self { bytes, format })
+    }
+
+    /// Width and height.
+    fn size(&self, path: &Path) -> Result<[u32; 2], CaptureError> {
+        let size = self.reader().into_dimensions();
+        size.map(<[u32; 2]>::from)
+            .map_err(|error| undecodable(path, &error))
+    }
+
+    /// Refuses a photo of which a part is missing, where the decoder would not; whether the file
+    /// looks damaged all the same. (Of a PNG file every part has a checksum, which the decoder checks.)
+    fn check_whole(&mut self, path: &Path) -> Result<bool, CaptureError> {
+        if self.format != ImageFormat::Jpeg {
+            return Ok(false);
+        }
+        let whole = jpeg::check(&self.bytes).map_err(|reason| CaptureError::IncompletePhoto {
+            path: path.to_path_buf(),
+            reason,
+        })?;
+        if !whole.ended {
+            // Without it the decoder makes up the last rows although they are there.
+            self.bytes.extend(jpeg::END);
+        }
+        Ok(whole.suspect)
+    }
+
+    /// The photo as stored: like COLMAP, without turning it by its EXIF orientation.
+    fn decode(&self, path: &Path) -> Result<DynamicImage, CaptureError> {
+        self.reader()
+            .decode()
+            .map_err(|error| undecodable(path, &error))
+    }
+
+    fn reader(&self) -> ImageReader<Cursor<&[u8]>> {
+        ImageReader::with_format(Cursor::new(&self.bytes), self.format)
+    }
+}
+
+fn undecodable(path: &Path, error: &ImageError) -> CaptureError {
+    CaptureError::UndecodablePhoto {
+        path: path.to_path_buf(),
+        reason: error.to_string().replace('\n', " "),
+    }
 }
 
 /// The camera's intrinsics for a photo of `size`, or nothing where the photo's shape is not the camera's.
@@ -179,24 +221,11 @@ fn transparent(loaded: &[Loaded]) -> Option<CaptureWarning> {
     })
 }
 
-/// Photos directly in `images/` that the model does not name. Sub-folders and a capture without that folder are not
-/// searched: what lies there may be masks or anything else.
-fn unregistered(root: &Path, model: &SparseModel) -> Option<CaptureWarning> {
-    let registered: HashSet<&str> = model.images.iter().map(|i| i.name.as_str()).collect();
-    let is_photo = |name: &str| {
-        let extension = Path::new(name).extension().unwrap_or_default();
-        ["jpg", "jpeg", "png"]
-            .iter()
-            .any(|known| extension.eq_ignore_ascii_case(known))
-    };
-    let mut names: Vec<String> = std::fs::read_dir(root.join("images"))
-        .ok()?
-        .filter_map(|entry| entry.ok()?.file_name().into_string().ok())
-        .filter(|name| is_photo(name) && !registered.contains(name.as_str()))
-        .collect();
-    names.sort();
-    Some(CaptureWarning::UnregisteredPhotos {
-        first: names.first()?.clone(),
-        count: names.len(),
+fn damaged(loaded: &[Loaded]) -> Option<CaptureWarning> {
+    let mut odd = loaded.iter().filter(|loaded| loaded.suspect);
+    let first = odd.next()?.view.name.clone();
+    Some(CaptureWarning::DamagedPhotos {
+        count: 1 + odd.count(),
+        first,
     })
 }

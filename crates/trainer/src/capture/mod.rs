@@ -13,6 +13,7 @@ mod colmap_text;
 mod downscale;
 mod error;
 mod images;
+mod jpeg;
 mod save;
 mod split;
 
@@ -43,7 +44,7 @@ pub struct Capture {
 /// One photo and the pinhole camera that took it.
 #[derive(Debug, Clone)]
 pub struct View {
-    /// Name of the photo as the capture gives it, relative to `images/`.
+    /// Name of the photo as the capture gives it, relative to the folder of the photos.
     pub name: String,
     /// Width of `image` in pixels.
     pub width: u32,
@@ -71,11 +72,17 @@ pub struct Point {
 pub struct CaptureOptions {
     /// Area-average every photo by this factor, at least 1 (1: as it is). Default 1.
     pub downscale: u32,
+    /// Folder of the photos, relative to the capture's or absolute. Default: `images`, or the capture's own folder where
+    /// there is no `images`.
+    pub images: Option<PathBuf>,
 }
 
 impl Default for CaptureOptions {
     fn default() -> Self {
-        Self { downscale: 1 }
+        Self {
+            downscale: 1,
+            images: None,
+        }
     }
 }
 
@@ -83,10 +90,13 @@ impl Capture {
     /// Reads the capture in the folder `root`.
     ///
     /// The COLMAP model is looked for in `sparse/0`, then `sparse`, then `root` itself, binary before text; the
-    /// photos in `images`, or beside the model's root when there is no such folder. Cameras must be `PINHOLE` or
-    /// `SIMPLE_PINHOLE`. Photos are decoded in parallel; where a photo's size is a uniform rescale of its camera's,
-    /// the intrinsics follow the photo and a warning says so. The held-out views are those `split.json` names, or
-    /// else every 8th by name from the first.
+    /// photos in [`CaptureOptions::images`]. Cameras must be `PINHOLE` or `SIMPLE_PINHOLE`. Photos are decoded in
+    /// parallel; where a photo's size is a uniform rescale of its camera's, the intrinsics follow the photo and a
+    /// warning says so. A photo of which a part is missing is refused. The held-out views are those `split.json`
+    /// names, or else every 8th by name from the first.
+    ///
+    /// Reading the model takes less than 32 times the memory of its files, a JPEG file 64 times (while it is read);
+    /// the pixels of the photos come on top, three bytes each, and up to twelve while a photo is decoded.
     ///
     /// # Errors
     ///
@@ -97,7 +107,7 @@ impl Capture {
             return Err(CaptureError::ZeroDownscale);
         }
         let (model, mut warnings) = colmap::read(root)?;
-        let views = images::load(root, &model, options.downscale, &mut warnings)?;
+        let views = images::load(root, &model, options, &mut warnings)?;
         let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
         let split = Split::of_capture(root, &names, &mut warnings)?;
         Ok(Self {
@@ -198,6 +208,8 @@ fn folder_name(root: &Path) -> String {
         .unwrap_or_else(|| "capture".to_owned())
 }
 
+#[cfg(test)]
+mod photo_tests;
 #[cfg(test)]
 mod test_capture;
 #[cfg(test)]

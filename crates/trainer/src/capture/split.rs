@@ -4,6 +4,7 @@ use std::collections::{HashMap, HashSet};
 use std::path::Path;
 
 use super::{CaptureError, CaptureWarning};
+use crate::text::without_mark;
 
 /// Every how many views one is held out where the capture does not say.
 const HOLD_OUT_EVERY: usize = 8;
@@ -46,8 +47,9 @@ impl Split {
             path: path.clone(),
             reason,
         };
-        let text = std::fs::read_to_string(&path).map_err(|error| bad(error.to_string()))?;
-        let file: SplitFile = serde_json::from_str(&text).map_err(|error| {
+        let bytes = std::fs::read(&path).map_err(|error| bad(error.to_string()))?;
+        let text = without_mark(&bytes).map_err(|reason| bad(reason.to_owned()))?;
+        let file: SplitFile = serde_json::from_slice(text).map_err(|error| {
             bad(format!(
                 "not a split (an object with the lists `train` and `test` of photo names): {error}"
             ))

@@ -201,13 +201,32 @@ fn a_named_split_is_followed() {
     );
     std::fs::write(&path, "[]").unwrap();
     error_of(root.path(), "split.json");
+
+    // As editors on Windows leave it.
+    let marked = format!("\u{feff}{}", json.replace(", ", ",\r\n"));
+    std::fs::write(&path, marked).unwrap();
+    assert_eq!(load(root.path()).unwrap().split, capture.split);
+    let utf16: Vec<u8> = json.encode_utf16().flat_map(u16::to_le_bytes).collect();
+    std::fs::write(&path, utf16).unwrap();
+    assert!(
+        error_of(root.path(), "split.json")
+            .to_string()
+            .contains("UTF-16")
+    );
 }
 
 #[test]
 fn downscale_averages_areas_and_divides_intrinsics() {
     let (root, _) = good();
     let full = load(root.path()).unwrap();
-    let half = Capture::load(root.path(), &CaptureOptions { downscale: 2 }).unwrap();
+    let half = Capture::load(
+        root.path(),
+        &CaptureOptions {
+            downscale: 2,
+            ..CaptureOptions::default()
+        },
+    )
+    .unwrap();
     for (full, half) in full.views.iter().zip(&half.views) {
         assert_eq!([half.width, half.height], [full.width / 2, full.height / 2]);
         assert_eq!(half.intrinsics, full.intrinsics.map(|value| value / 2.0));
@@ -228,12 +247,18 @@ fn downscale_averages_areas_and_divides_intrinsics() {
     assert_eq!((w, h), (2, 1));
     assert_eq!(pixels, [8, 0, 255, 11, 0, 255]);
 
-    let none = CaptureOptions { downscale: 0 };
+    let none = CaptureOptions {
+        downscale: 0,
+        ..CaptureOptions::default()
+    };
     assert!(matches!(
         Capture::load(root.path(), &none),
         Err(CaptureError::ZeroDownscale)
     ));
-    let much = CaptureOptions { downscale: 3 };
+    let much = CaptureOptions {
+        downscale: 3,
+        ..CaptureOptions::default()
+    };
     let error = Capture::load(root.path(), &much).unwrap_err();
     assert!(matches!(error, CaptureError::PhotoTooSmall { .. }));
 }
@@ -295,6 +320,58 @@ fn files_that_are_not_needed_do_no_harm() {
             CaptureWarning::UnregisteredPhotos { count: 1, first }
         ] if first == "extra.JPG"
     ));
+}
+
+#[test]
+fn what_follows_the_last_record_is_an_error() {
+    let (root, model) = good();
+    let folder = root.path().join("sparse/0");
+    for (file, bytes, count) in [
+        ("cameras.bin", model.cameras_bin(), "2 cameras"),
+        ("images.bin", model.images_bin(), "9 images"),
+        ("points3D.bin", model.points_bin(), "5 points"),
+    ] {
+        for more in [&[0][..], b"0123456"] {
+            std::fs::write(folder.join(file), [&bytes, more].concat()).unwrap();
+            let message = error_of(root.path(), file).to_string();
+            let bytes = format!("{} bytes", more.len());
+            assert!(
+                message.contains(&bytes) && message.contains(count),
+                "{message}"
+            );
+        }
+        std::fs::write(folder.join(file), bytes).unwrap();
+    }
+    load(root.path()).unwrap();
+}
+
+#[test]
+fn a_wrong_count_is_told() {
+    let (root, model) = good();
+    let folder = root.path().join("sparse/0");
+    std::fs::remove_dir_all(&folder).unwrap();
+    model.write_text(&folder);
+    assert_eq!(load(root.path()).unwrap().warnings, []);
+    let counts = [("cameras", 2, 3), ("images", 9, 15), ("points3D", 5, 4)];
+    for (stem, read, announced) in counts {
+        let path = folder.join(format!("{stem}.txt"));
+        let text = std::fs::read_to_string(&path).unwrap();
+        let what = stem.trim_end_matches("3D");
+        for count in [read, announced] {
+            let head = format!("\u{feff}# Number of {what}: {count}, mean of something: 2.5\r\n");
+            std::fs::write(&path, head + &text).unwrap();
+            let warnings = load(root.path()).unwrap().warnings;
+            let messages: Vec<String> = warnings.iter().map(ToString::to_string).collect();
+            assert_eq!(messages.len(), usize::from(count != read), "{messages:?}");
+            for message in messages {
+                let says = |word: &str| assert!(message.contains(word), "{message}");
+                says(&format!("{stem}.txt"));
+                says(&format!("{announced} {what}"));
+                says(&format!("lists {read}"));
+            }
+        }
+        std::fs::write(&path, text).unwrap();
+    }
 }
 
 #[test]
@@ -382,7 +459,7 @@ fn message_after(file: &str, spoil: impl FnOnce(&mut TestCapture)) -> String {
 #[test]
 fn nonsense_in_a_record_is_named() {
     type Case = (&'static str, &'static str, fn(&mut TestCapture));
-    let cases: [Case; 11] = [
+    let cases: [Case; 13] = [
         ("points3D.bin", "point 3", |m| {
             m.points[3].1.position[1] = f64::INFINITY;
         }),
@@ -395,6 +472,8 @@ fn nonsense_in_a_record_is_named() {
         ("images.bin", "twice", |m| {
             m.images[2].4 = m.images[1].4.clone();
         }),
+        ("images.bin", r"a\nb", |m| m.images[2].4 = "a\nb".into()),
+        ("cameras.bin", "twice", |m| m.cameras[1].0 = 7),
         ("cameras.bin", "camera 7", |m| m.cameras[0].2 = 0),
         ("cameras.bin", "height", |m| m.cameras[0].3 = u64::MAX),
         ("cameras.bin", "fx NaN", |m| m.cameras[0].4[0] = f64::NAN),

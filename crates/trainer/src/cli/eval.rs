@@ -5,8 +5,9 @@ use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
+use super::photos::PhotoArgs;
 use super::{Failure, GlobalArgs, device, print, scene};
-use crate::capture::{Capture, CaptureOptions, View};
+use crate::capture::View;
 use crate::report::metrics::write_json;
 use crate::{Scores, evaluate};
 
@@ -14,7 +15,8 @@ use crate::{Scores, evaluate};
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   splat eval examples/data/saharov out/saharov/scene.ply
-  splat eval photos/ scene.ply --split all --json scores.json")]
+  splat eval photos/ scene.ply --split all --json scores.json
+  splat eval photos/ scene.ply --images images_4")]
 pub struct EvalArgs {
     /// Capture: a folder with `images/` and `sparse/0/`
     pub capture: PathBuf,
@@ -26,9 +28,8 @@ pub struct EvalArgs {
     /// Views to measure
     #[arg(long, value_enum, default_value_t)]
     pub split: SplitChoice,
-    /// Area-average the photos by this factor
-    #[arg(long, value_name = "K", default_value_t = 1)]
-    pub downscale: u32,
+    #[command(flatten)]
+    pub photos: PhotoArgs,
     /// Also write the figures as JSON
     #[arg(long, value_name = "OUT")]
     pub json: Option<PathBuf>,
@@ -48,13 +49,7 @@ pub enum SplitChoice {
 
 /// Runs the command.
 pub(super) fn run(args: &EvalArgs, global: &GlobalArgs) -> Result<(), Failure> {
-    let options = CaptureOptions {
-        downscale: args.downscale,
-    };
-    let capture = Capture::load(&args.capture, &options)?;
-    for warning in &capture.warnings {
-        global.say(format_args!("warning: {warning}"));
-    }
+    let capture = args.photos.open(&args.capture, global)?;
     let views: Vec<&View> = match args.split {
         SplitChoice::Test => capture.test_views().collect(),
         SplitChoice::Train => capture.train_views().collect(),

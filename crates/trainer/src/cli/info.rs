@@ -9,8 +9,9 @@ use std::path::PathBuf;
 use clap::Args;
 use splat_model::files::ply;
 
+use super::photos::PhotoArgs;
 use super::{Failure, GlobalArgs, print};
-use crate::capture::{Capture, CaptureOptions};
+use crate::capture::Capture;
 
 /// Show what a scene or a capture is: counts, bounds, histograms, cameras, warnings
 #[derive(Debug, Args)]
@@ -21,15 +22,19 @@ pub struct InfoArgs {
     /// A scene file (PLY) or a capture folder
     #[arg(value_name = "SCENE|CAPTURE")]
     pub path: PathBuf,
+    #[command(flatten)]
+    pub photos: PhotoArgs,
 }
 
 /// Runs the command.
 pub(super) fn run(args: &InfoArgs, _: &GlobalArgs) -> Result<(), Failure> {
     let path = &args.path;
     let text = if path.is_dir() {
-        capture::describe(&Capture::load(path, &CaptureOptions::default())?)
+        capture::describe(&Capture::load(path, &args.photos.options())?)
     } else {
-        scene::describe(path, &ply::read(path)?)
+        let scene = ply::read(path)?;
+        args.photos.refuse("a scene has no photos")?;
+        scene::describe(path, &scene)
     };
     print(&text);
     Ok(())

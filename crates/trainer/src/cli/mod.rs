@@ -8,6 +8,7 @@ mod failure;
 mod gradcheck;
 mod info;
 mod interrupt;
+mod photos;
 mod render;
 mod scene;
 mod train;

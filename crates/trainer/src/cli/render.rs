@@ -2,7 +2,6 @@
 
 mod cameras;
 
-use std::collections::HashSet;
 use std::path::PathBuf;
 
 use burn::tensor::Tensor;
@@ -11,9 +10,11 @@ use splat_model::ops::device::to_host;
 use splat_model::ops::{OpError, Projected, rasterize};
 use splat_model::{CameraTensors, Gaussians, RenderSettings, project_gaussians, render_projected};
 
+use super::photos::PhotoArgs;
 use super::{Failure, GlobalArgs, device, scene};
 use crate::report::png::Picture;
 use crate::report::progress::Progress;
+use crate::report::view_names::ViewNames;
 
 /// Render pictures of a scene
 #[derive(Debug, Args)]
@@ -34,6 +35,8 @@ pub struct RenderArgs {
     pub sh_precision: scene::PrecisionChoice,
     #[command(flatten)]
     cameras: CameraArgs,
+    #[command(flatten)]
+    photos: PhotoArgs,
     /// Folder to write the pictures to
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
@@ -64,36 +67,48 @@ enum Channel {
     Depth,
 }
 
+impl Channel {
+    /// What the file's name has before `.png`.
+    fn suffix(self) -> &'static str {
+        match self {
+            Self::Rgb => "",
+            Self::Alpha => ".alpha",
+            Self::Depth => ".depth",
+        }
+    }
+}
+
 /// Runs the command.
 pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let device = device::open(global)?.device;
     let (gaussians, settings) = scene::open(&args.scene, &device, args.sh_precision, global)?;
+    if args.cameras.capture.is_none() {
+        args.photos.refuse("of use with --capture only")?;
+    }
     let cameras = match &args.cameras {
         CameraArgs {
             capture: Some(path),
             ..
-        } => cameras::of_capture(path, global)?,
+        } => cameras::of_capture(&args.photos.open(path, global)?),
         CameraArgs {
             camera: Some(path), ..
         } => cameras::of_file(path)?,
         CameraArgs { orbit, .. } => cameras::orbit(&gaussians.to_data(), orbit.unwrap_or(1)),
     };
     let mut progress = Progress::new(cameras.len() as u64, 0, global.quiet);
-    let mut taken = HashSet::new();
-    for (done, (name, camera)) in cameras.iter().enumerate() {
-        let stem = file_stem(name);
-        if !taken.insert(stem.clone()) {
-            return Err(Failure::BadInput(format!(
-                "two cameras would both be written to {stem}.png; rename one"
-            )));
-        }
+    let suffixes: Vec<&str> = args
+        .channels
+        .iter()
+        .map(|channel| channel.suffix())
+        .collect();
+    let names = ViewNames::new(cameras.iter().map(|(name, _)| name.as_str()), &suffixes);
+    if let Some(note) = names.note() {
+        global.say(note);
+    }
+    for (done, ((name, camera), stem)) in cameras.iter().zip(&names.stems).enumerate() {
         let camera = camera.relative_to(gaussians.origin).tensors(&device);
         for (channel, picture) in pictures(&gaussians, &camera, &settings, &args.channels)? {
-            let suffix = match channel {
-                Channel::Rgb => "",
-                Channel::Alpha => ".alpha",
-                Channel::Depth => ".depth",
-            };
+            let suffix = channel.suffix();
             picture.write(&args.out.join(format!("{stem}{suffix}.png")))?;
         }
         progress.update(done as u64 + 1, || name.clone());
@@ -165,12 +180,6 @@ fn depth_shades(depth: &[f32], alpha: &[f32]) -> Vec<f32> {
         .collect()
 }
 
-/// A file name of a camera's name: without its extension, in one folder.
-fn file_stem(name: &str) -> String {
-    let stem = std::path::Path::new(name).with_extension("");
-    stem.to_string_lossy().replace(['/', '\\', ':'], "_")
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -181,11 +190,5 @@ mod tests {
         let shades = depth_shades(&[1.0, 4.0, 9.0, 3.0], &[0.5, 1.0, 0.1, 1.0]);
         assert_eq!(shades, [1.0, 0.0, 0.0, 0.5]);
         assert_eq!(depth_shades(&[1.0], &[0.0]), [0.0]);
-    }
-
-    #[test]
-    fn names_stay_in_the_folder() {
-        assert_eq!(file_stem("left/a.b.JPG"), "left_a.b");
-        assert_eq!(file_stem("../../up.png"), ".._.._up");
     }
 }

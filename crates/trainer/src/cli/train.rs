@@ -10,6 +10,7 @@ use clap::{Args, ValueEnum};
 use splat_model::files::ply;
 
 use super::device::ChosenDevice;
+use super::photos::PhotoArgs;
 use super::{Failure, GlobalArgs, device, eval, interrupt, print, scene};
 use crate::capture::{Capture, CaptureOptions, View};
 use crate::report::curves::Curves;
@@ -18,6 +19,7 @@ use crate::report::memory::peak_rss_bytes;
 use crate::report::metrics::{Metrics, write_json};
 use crate::report::png::Picture;
 use crate::report::progress::Progress;
+use crate::report::view_names::ViewNames;
 use crate::report::{ReportError, write_atomically};
 use crate::train::{Checkpoint, CheckpointError, History, TrainConfig, Trained, Trainer};
 use crate::{Scores, evaluate};
@@ -36,6 +38,7 @@ const AUTOSAVE: Duration = Duration::from_secs(60);
 #[command(after_help = "Examples:
   splat train examples/data/saharov --steps 1000
   splat train photos/ --downscale 2 --steps 7000 --out out/garden
+  splat train photos/ --images images_4
   splat train photos/ --resume out/garden
 
 Writes to DIR: scene.ply, metrics.json, config.toml, curves.svg, losses.csv and views/*.png (truth
@@ -50,9 +53,8 @@ pub struct TrainArgs {
     /// Number of steps; the recipe's milestones scale with it [default: 30000]
     #[arg(long, value_name = "N")]
     pub steps: Option<usize>,
-    /// Area-average the photos by this factor [default: 1]
-    #[arg(long, value_name = "K")]
-    pub downscale: Option<u32>,
+    #[command(flatten)]
+    pub photos: PhotoArgs,
     /// Highest degree of spherical harmonics, 0 to 3 [default: 3]
     #[arg(long, value_name = "D")]
     pub sh_degree: Option<usize>,
@@ -92,7 +94,7 @@ impl TrainArgs {
         };
         let Strategy::Adc = self.strategy;
         config.steps = self.steps.unwrap_or(config.steps);
-        config.downscale = self.downscale.unwrap_or(config.downscale);
+        config.downscale = self.photos.downscale.unwrap_or(config.downscale);
         config.seed = global.seed.unwrap_or(config.seed);
         config.init.sh_degree = self.sh_degree.unwrap_or(config.init.sh_degree);
         config.density.max_gaussians = self.max_gaussians.or(config.density.max_gaussians);
@@ -117,11 +119,15 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     };
     let options = CaptureOptions {
         downscale: config.downscale,
+        ..args.photos.options()
     };
     let capture = Capture::load(&args.capture, &options)?;
     capture.check_trainable()?;
     for warning in &capture.warnings {
         global.say(format_args!("warning: {warning}"));
+    }
+    if let Some(note) = picture_names(&capture).note() {
+        global.say(note);
     }
     let out = args.out(&capture);
     let chosen = device::open(global)?;
@@ -243,10 +249,13 @@ fn finish(
     write_losses(&out.join("losses.csv"), &trained.history)?;
 
     let views: Vec<&View> = capture.test_views().collect();
+    let names = picture_names(capture);
+    let mut stems = names.stems.iter();
     let mut written = Ok(());
     let keep = |view: &View, rendered: Vec<f32>| {
-        if written.is_ok() {
-            written = write_view(&out.join("views"), view, &rendered);
+        // Views come in the order given.
+        if let (Ok(()), Some(stem)) = (&written, stems.next()) {
+            written = write_view(&out.join("views"), stem, view, &rendered);
         }
     };
     let scores = evaluate(
@@ -277,13 +286,18 @@ fn finish(
     Ok(scores)
 }
 
+/// The names of the held-out views' pictures.
+fn picture_names(capture: &Capture) -> ViewNames {
+    let names = capture.test_views().map(|view| view.name.as_str());
+    ViewNames::new(names, &[""])
+}
+
 /// Truth beside render.
-fn write_view(folder: &Path, view: &View, rendered: &[f32]) -> Result<(), ReportError> {
+fn write_view(folder: &Path, stem: &str, view: &View, rendered: &[f32]) -> Result<(), ReportError> {
     let truth = Picture::from_rgb8(view.width, view.height, view.image.to_vec())?;
     let render = Picture::from_rgb_f32(view.width, view.height, rendered)?;
-    let name = Path::new(&view.name).with_extension("png");
-    let name = name.to_string_lossy().replace(['/', '\\', ':'], "_");
-    truth.beside(&render)?.write(&folder.join(name))
+    let path = folder.join(format!("{stem}.png"));
+    truth.beside(&render)?.write(&path)
 }
 
 /// The course of the run: the weighted sum, then each term.

@@ -368,7 +368,10 @@ mod tests {
     #[test]
     fn stages_cover_the_step_and_its_work_is_counted() {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
-        let options = CaptureOptions { downscale: 16 };
+        let options = CaptureOptions {
+            downscale: 16,
+            ..CaptureOptions::default()
+        };
         let capture = Arc::new(Capture::load(folder.as_ref(), &options).unwrap());
         let config = at_degree(&TrainConfig::default(), 3);
         let samples = on_threads(1, || run(&capture, &config, 1, 3)).unwrap();

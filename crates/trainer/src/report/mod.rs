@@ -10,6 +10,7 @@ pub mod memory;
 pub mod metrics;
 pub mod png;
 pub mod progress;
+pub mod view_names;
 
 use std::path::PathBuf;
 

@@ -75,7 +75,10 @@ mod tests {
     #[test]
     fn a_small_view_sees_the_same_and_is_made_once() {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
-        let options = CaptureOptions { downscale: 4 };
+        let options = CaptureOptions {
+            downscale: 4,
+            ..CaptureOptions::default()
+        };
         let capture = Capture::load(folder.as_ref(), &options).unwrap();
         let mut views = CoarseViews::default();
         let small = views.view(&capture, 3, 2);

@@ -656,7 +656,10 @@ mod tests {
 
     fn capture() -> Arc<Capture> {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
-        let options = CaptureOptions { downscale: 8 };
+        let options = CaptureOptions {
+            downscale: 8,
+            ..CaptureOptions::default()
+        };
         Arc::new(Capture::load(folder.as_ref(), &options).unwrap())
     }
 

@@ -6,7 +6,8 @@ use std::sync::Arc;
 use clap::Args;
 
 use super::{Failure, GlobalArgs};
-use crate::capture::{Capture, CaptureOptions};
+use crate::capture::Capture;
+use crate::cli::photos::PhotoArgs;
 use crate::train::TrainConfig;
 
 /// The capture that the project carries.
@@ -15,9 +16,8 @@ pub(super) const EXAMPLE: &str = "examples/data/saharov";
 /// The capture, and how long to measure.
 #[derive(Debug, Clone, Args)]
 pub(super) struct CaptureArgs {
-    /// Area-average the photos by this factor
-    #[arg(long, value_name = "K", default_value_t = 1)]
-    pub(super) downscale: u32,
+    #[command(flatten)]
+    pub(super) photos: PhotoArgs,
     /// Measure each setting for about so long; once through it in any case
     #[arg(long, value_name = "S", default_value_t = 10.0)]
     pub(super) seconds: f64,
@@ -31,21 +31,15 @@ impl CaptureArgs {
         global: &GlobalArgs,
     ) -> Result<Arc<Capture>, Failure> {
         let folder = folder.map_or_else(|| PathBuf::from(EXAMPLE), Path::to_owned);
-        let options = CaptureOptions {
-            downscale: self.downscale,
-        };
-        let capture = Capture::load(&folder, &options)?;
+        let capture = self.photos.open(&folder, global)?;
         capture.check_trainable()?;
-        for warning in &capture.warnings {
-            global.say(format_args!("warning: {warning}"));
-        }
         Ok(Arc::new(capture))
     }
 
     /// The usual settings, but for what was asked for.
     pub(super) fn config(&self, global: &GlobalArgs) -> TrainConfig {
         TrainConfig {
-            downscale: self.downscale,
+            downscale: self.photos.options().downscale,
             seed: global.seed.unwrap_or_default(),
             ..TrainConfig::default()
         }
@@ -53,10 +47,8 @@ impl CaptureArgs {
 
     /// As they are typed, with a space before each.
     pub(super) fn typed(&self) -> String {
-        let mut text = String::new();
-        if self.downscale != 1 {
-            text += &format!(" --downscale {}", self.downscale);
-        }
-        text
+        let words = self.photos.words();
+        let words = words.iter().map(|word| format!(" {}", word.display()));
+        words.collect()
     }
 }

@@ -9,8 +9,9 @@ use splat_model::Camera;
 use splat_model::files::SplatData;
 use splat_model::ops::ImageSize;
 
-use super::super::{Failure, GlobalArgs};
-use crate::capture::{Capture, CaptureOptions};
+use super::super::Failure;
+use crate::capture::{Capture, View};
+use crate::text::without_mark;
 
 /// Most pixels on a side: one picture of this size is about 3 GB in the making.
 const MOST_PIXELS: u32 = 16_384;
@@ -22,16 +23,9 @@ const ORBIT_SIZE: ImageSize = ImageSize {
 const ORBIT_FOCAL: f64 = 600.0;
 
 /// The cameras of every view of a capture, by the photo's name.
-pub(super) fn of_capture(
-    path: &Path,
-    global: &GlobalArgs,
-) -> Result<Vec<(String, Camera)>, Failure> {
-    let capture = Capture::load(path, &CaptureOptions::default())?;
-    for warning in &capture.warnings {
-        global.say(format_args!("warning: {warning}"));
-    }
-    let named = |view: &crate::capture::View| (view.name.clone(), crate::train::camera(view));
-    Ok(capture.views.iter().map(named).collect())
+pub(super) fn of_capture(capture: &Capture) -> Vec<(String, Camera)> {
+    let named = |view: &View| (view.name.clone(), crate::train::camera(view));
+    capture.views.iter().map(named).collect()
 }
 
 /// One camera of a camera file.
@@ -48,9 +42,10 @@ struct FileCamera {
 /// The cameras of a file, by their names or their place in it.
 pub(super) fn of_file(path: &Path) -> Result<Vec<(String, Camera)>, Failure> {
     let bad = |reason: String| Failure::BadInput(format!("{}: {reason}", path.display()));
-    let text = std::fs::read_to_string(path).map_err(|error| bad(error.to_string()))?;
+    let bytes = std::fs::read(path).map_err(|error| bad(error.to_string()))?;
+    let text = without_mark(&bytes).map_err(|reason| bad(reason.to_owned()))?;
     let read = || -> serde_json::Result<Vec<FileCamera>> {
-        match serde_json::from_str(&text)? {
+        match serde_json::from_slice(text)? {
             list @ serde_json::Value::Array(_) => serde_json::from_value(list),
             one => Ok(vec![serde_json::from_value(one)?]),
         }

@@ -1,0 +1,223 @@
+//! What is promised of photos: each is whole or refused, wherever they lie.
+
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+
+use image::{ImageFormat, RgbImage};
+use tempfile::TempDir;
+
+use super::test_capture::{SIZES, TestCapture};
+use super::*;
+
+/// First photo by name, of the size of the first camera.
+const FIRST: &str = "view r.png";
+
+fn good() -> (TempDir, TestCapture) {
+    let root = TempDir::new().unwrap();
+    let capture = TestCapture::new();
+    capture.write_photos(root.path());
+    capture.write_binary(&root.path().join("sparse/0"));
+    (root, capture)
+}
+
+fn load(root: &Path) -> Result<Capture, CaptureError> {
+    Capture::load(root, &CaptureOptions::default())
+}
+
+fn load_from(root: &Path, images: &Path) -> Result<Capture, CaptureError> {
+    let options = CaptureOptions {
+        images: Some(images.to_path_buf()),
+        ..CaptureOptions::default()
+    };
+    Capture::load(root, &options)
+}
+
+/// A photo that no decoder guesses, as a file of this format (the file's name does not matter).
+fn photo(format: ImageFormat) -> Vec<u8> {
+    let [w, h] = SIZES[0];
+    let noise = |x: u32, y: u32| [x * y * 7, x * x + 3 * y, x ^ (y * 11)].map(|v| v as u8);
+    let photo = RgbImage::from_fn(w, h, |x, y| image::Rgb(noise(x, y)));
+    let mut bytes = Cursor::new(Vec::new());
+    photo.write_to(&mut bytes, format).unwrap();
+    bytes.into_inner()
+}
+
+#[test]
+fn a_part_of_a_photo_is_refused_by_name() {
+    let (root, _) = good();
+    let path = root.path().join("images").join(FIRST);
+    for format in [ImageFormat::Jpeg, ImageFormat::Png] {
+        let bytes = photo(format);
+        std::fs::write(&path, &bytes).unwrap();
+        let whole = load(root.path()).unwrap();
+        assert_eq!(whole.warnings, []);
+        let mut refused = 0;
+        for until in 0..bytes.len() {
+            std::fs::write(&path, &bytes[..until]).unwrap();
+            match load(root.path()) {
+                Ok(capture) => assert_eq!(
+                    capture.views[0].image,
+                    whole.views[0].image,
+                    "{format:?} cut at {until} of {}",
+                    bytes.len()
+                ),
+                Err(error) => {
+                    let message = error.to_string();
+                    assert!(
+                        message.contains(FIRST) && !message.contains('\n'),
+                        "{message}"
+                    );
+                    refused += 1;
+                }
+            }
+        }
+        // All but what comes after the last pixel.
+        assert!(
+            refused + 16 >= bytes.len(),
+            "{format:?}: {refused} of {}",
+            bytes.len()
+        );
+    }
+}
+
+#[test]
+fn a_photo_with_too_much_in_it_is_told() {
+    let (root, _) = good();
+    let path = root.path().join("images").join(FIRST);
+    let mut bytes = photo(ImageFormat::Jpeg);
+    let header = bytes
+        .windows(2)
+        .position(|pair| pair == [0xff, 0xc0])
+        .unwrap();
+    assert_eq!(bytes[header + 5..header + 9], [0, 24, 0, 32]);
+    // Half as wide and high, by the header.
+    bytes[header + 6] = 12;
+    bytes[header + 8] = 16;
+    std::fs::write(&path, bytes).unwrap();
+    let warnings = load(root.path()).unwrap().warnings;
+    let is_damaged = |warning: &CaptureWarning| match warning {
+        CaptureWarning::DamagedPhotos { count: 1, first } => first == FIRST,
+        _ => false,
+    };
+    assert!(warnings.iter().any(is_damaged), "{warnings:?}");
+}
+
+#[test]
+fn photos_are_read_from_the_folder_that_is_named() {
+    let (root, _) = good();
+    let usual = load(root.path()).unwrap();
+    let moved = root.path().join("images_4");
+    std::fs::rename(root.path().join("images"), &moved).unwrap();
+    for folder in [
+        "images_4".into(),
+        moved.clone(),
+        PathBuf::from("./images_4/"),
+    ] {
+        let capture = load_from(root.path(), &folder).unwrap();
+        assert_eq!(capture.warnings, []);
+        let pixels = |capture: &Capture| -> Vec<_> {
+            capture
+                .views
+                .iter()
+                .map(|view| view.image.clone())
+                .collect()
+        };
+        assert_eq!(pixels(&capture), pixels(&usual));
+        assert_eq!(capture.views[0].name, FIRST);
+    }
+    // And from anywhere else.
+    let elsewhere = TempDir::new().unwrap();
+    let elsewhere = elsewhere.path().join("photos");
+    std::fs::create_dir_all(&elsewhere).unwrap();
+    for entry in std::fs::read_dir(&moved).unwrap() {
+        let entry = entry.unwrap();
+        std::fs::copy(entry.path(), elsewhere.join(entry.file_name())).unwrap();
+    }
+    load_from(root.path(), &elsewhere).unwrap();
+}
+
+#[test]
+fn another_folder_with_the_photos_is_suggested() {
+    let (root, _) = good();
+    let images = root.path().join("images");
+    std::fs::rename(&images, root.path().join("images_2")).unwrap();
+    let suggested = |error: CaptureError| {
+        let message = error.to_string();
+        assert!(
+            message.contains("--images") && message.contains("`images_2`"),
+            "{message}"
+        );
+        assert!(!message.contains('\n'), "{message}");
+        message
+    };
+    // No folder of the usual name, an empty one, and one with a few of them.
+    suggested(load(root.path()).unwrap_err());
+    std::fs::create_dir(&images).unwrap();
+    suggested(load(root.path()).unwrap_err());
+    std::fs::copy(root.path().join("images_2").join(FIRST), images.join(FIRST)).unwrap();
+    let message = suggested(load(root.path()).unwrap_err());
+    assert!(message.contains("9 photo(s)"), "{message}");
+
+    let message = suggested(load_from(root.path(), "nowhere".as_ref()).unwrap_err());
+    assert!(message.contains("nowhere"), "{message}");
+
+    // Beside the model.
+    std::fs::remove_dir_all(&images).unwrap();
+    std::fs::create_dir(&images).unwrap();
+    for entry in std::fs::read_dir(root.path().join("images_2")).unwrap() {
+        let entry = entry.unwrap();
+        std::fs::rename(entry.path(), root.path().join(entry.file_name())).unwrap();
+    }
+    let message = load(root.path()).unwrap_err().to_string();
+    assert!(message.contains("the folder `.`"), "{message}");
+    load_from(root.path(), ".".as_ref()).unwrap();
+
+    // Nothing is suggested that is not there.
+    let bare = TempDir::new().unwrap();
+    TestCapture::new().write_binary(&bare.path().join("sparse/0"));
+    let message = load(bare.path()).unwrap_err().to_string();
+    assert!(!message.contains("--images"), "{message}");
+}
+
+/// The first of the photos that the model does not name, and how many there are.
+fn left_out(root: &Path) -> Option<(String, usize)> {
+    load(root)
+        .unwrap()
+        .warnings
+        .into_iter()
+        .find_map(|warning| match warning {
+            CaptureWarning::UnregisteredPhotos { first, count } => Some((first, count)),
+            _ => None,
+        })
+}
+
+#[test]
+fn photos_that_the_model_does_not_name_are_counted_in_sub_folders_too() {
+    let (root, mut model) = good();
+    let images = root.path().join("images");
+    // Masks beside a model of photos in one folder are none of its photos.
+    std::fs::create_dir(images.join("masks")).unwrap();
+    std::fs::write(images.join("masks/a.png"), []).unwrap();
+    assert_eq!(left_out(root.path()), None);
+    for name in ["b.TIF", "a.png", "._a.png", "notes.txt"] {
+        std::fs::write(images.join(name), []).unwrap();
+    }
+    assert_eq!(left_out(root.path()), Some(("a.png".to_owned(), 2)));
+
+    // Of a rig of cameras with a folder each, one may be missing.
+    std::fs::remove_dir_all(&images).unwrap();
+    for (_, _, _, camera, name) in &mut model.images {
+        let folder = format!("cam{camera}");
+        std::fs::create_dir_all(images.join(&folder)).unwrap();
+        *name = format!("{folder}/{name}");
+    }
+    model.write_photos(root.path());
+    model.write_binary(&root.path().join("sparse/0"));
+    assert_eq!(left_out(root.path()), None);
+    for name in ["cam7/z.jpg", "cam8/b/z.jpg", "cam8/.thumbnails/z.jpg"] {
+        let path = images.join(name);
+        std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+        std::fs::write(path, []).unwrap();
+    }
+    assert_eq!(left_out(root.path()), Some(("cam7/z.jpg".to_owned(), 2)));
+}
