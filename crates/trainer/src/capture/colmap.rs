@@ -45,8 +45,11 @@ pub(super) struct Image {
 impl Image {
     /// World to camera, row-major 4x4, from the normalised quaternion and the translation.
     pub fn viewmat(&self) -> [[f64; 4]; 4] {
-        let length = self.quaternion.iter().map(|q| q * q).sum::<f64>().sqrt();
-        let [w, x, y, z] = self.quaternion.map(|q| q / length);
+        // By the largest component first, so that the squares neither vanish nor overflow.
+        let largest = self.quaternion.iter().fold(0.0, |m: f64, q| m.max(q.abs()));
+        let scaled = self.quaternion.map(|q| q / largest);
+        let length = scaled.iter().map(|q| q * q).sum::<f64>().sqrt();
+        let [w, x, y, z] = scaled.map(|q| q / length);
         let [tx, ty, tz] = self.translation;
         [
             [
@@ -134,6 +137,28 @@ pub(super) fn read(root: &Path) -> Result<(SparseModel, Vec<CaptureWarning>), Ca
     Ok((model, warnings))
 }
 
+/// Reads and checks a model from the content of its three files, whose names are for messages.
+pub(super) fn parse(
+    binary: bool,
+    [cameras, images, points]: [&[u8]; 3],
+) -> Result<SparseModel, CaptureError> {
+    let files = ModelFiles::of(Path::new(""), binary);
+    let (cameras, images, points) = if binary {
+        (
+            colmap_binary::parse_cameras(&files.cameras, cameras)?,
+            colmap_binary::parse_images(&files.images, images)?,
+            colmap_binary::parse_points(&files.points, points)?,
+        )
+    } else {
+        (
+            colmap_text::parse_cameras(&files.cameras, cameras)?,
+            colmap_text::parse_images(&files.images, images)?,
+            colmap_text::parse_points(&files.points, points)?,
+        )
+    };
+    assemble(&files, cameras, images, points)
+}
+
 /// The folder that holds the model.
 fn find_folder(root: &Path) -> Result<(PathBuf, Vec<CaptureWarning>), CaptureError> {
     let metadata = root.metadata().map_err(|source| CaptureError::Io {
@@ -191,17 +216,7 @@ impl ModelFiles {
     /// The binary files if all are there, else the text files; otherwise names the missing one of the encoding that
     /// has the cameras.
     fn find(folder: &Path) -> Result<Self, CaptureError> {
-        let of = |binary: bool| {
-            let file =
-                |stem: &str| folder.join(format!("{stem}.{}", if binary { "bin" } else { "txt" }));
-            Self {
-                binary,
-                cameras: file("cameras"),
-                images: file("images"),
-                points: file("points3D"),
-            }
-        };
-        let [binary, text] = [of(true), of(false)];
+        let [binary, text] = [true, false].map(|binary| Self::of(folder, binary));
         match (binary.missing(), text.missing()) {
             (None, _) => Ok(binary),
             (_, None) => Ok(text),
@@ -213,6 +228,17 @@ impl ModelFiles {
                 };
                 Err(CaptureError::MissingModelFile { path: path.clone() })
             }
+        }
+    }
+
+    fn of(folder: &Path, binary: bool) -> Self {
+        let extension = if binary { "bin" } else { "txt" };
+        let file = |stem: &str| folder.join(format!("{stem}.{extension}"));
+        Self {
+            binary,
+            cameras: file("cameras"),
+            images: file("images"),
+            points: file("points3D"),
         }
     }
 
@@ -237,7 +263,13 @@ fn assemble(
             record: format!("camera {}", camera.id),
             reason,
         })?;
-        by_id.insert(camera.id, camera);
+        if by_id.insert(camera.id, camera).is_some() {
+            return Err(CaptureError::BadRecord {
+                path: files.cameras.clone(),
+                record: format!("camera {}", camera.id),
+                reason: "its id occurs twice".to_owned(),
+            });
+        }
     }
 
     if images.is_empty() {
@@ -296,6 +328,9 @@ fn check_image(image: &Image, cameras: &HashMap<u32, Camera>, unique: bool) -> R
     if !unique {
         return Err("its name occurs twice".to_owned());
     }
+    if !stays_inside(&image.name) {
+        return Err("its name leads out of the folder of photos".to_owned());
+    }
     if !cameras.contains_key(&image.camera_id) {
         return Err(format!(
             "its camera {} is not among the cameras",
@@ -308,12 +343,20 @@ fn check_image(image: &Image, cameras: &HashMap<u32, Camera>, unique: bool) -> R
             image.translation
         ));
     }
-    let squared: f64 = image.quaternion.iter().map(|q| q * q).sum();
-    if !(squared.is_finite() && squared > 0.0) {
+    let rotates = image.quaternion.iter().any(|q| *q != 0.0);
+    if !(rotates && image.quaternion.iter().all(|q| q.is_finite())) {
         return Err(format!(
             "its quaternion {:?} is not a rotation",
             image.quaternion
         ));
     }
     Ok(())
+}
+
+/// Whether a name, in the notation of any system, is that of something in the folder that it is looked for in.
+fn stays_inside(name: &str) -> bool {
+    let has_drive = matches!(name.as_bytes(), [drive, b':', ..] if drive.is_ascii_alphabetic());
+    let from_root = has_drive || name.starts_with(['/', '\\']);
+    let mut steps = name.split(['/', '\\']);
+    !from_root && !name.contains('\0') && !steps.any(|step| step == "..")
 }

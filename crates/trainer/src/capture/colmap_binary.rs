@@ -19,8 +19,12 @@ const TRACK_ENTRY: usize = 4 + 4;
 
 /// Reads `cameras.bin`.
 pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>, CaptureError> {
-    let bytes = read_file(path)?;
-    let mut reader = Reader::new(path, &bytes);
+    parse_cameras(path, &read_file(path)?)
+}
+
+/// [`read_cameras`] on the content of the file; `path` is for messages.
+pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<Camera>, CaptureError> {
+    let mut reader = Reader::new(path, bytes);
     reader.records("camera", "cameras", MIN_CAMERA, |reader, record| {
         let id = reader.u32(record, "id")?;
         let model = model_name(reader.i32(record, "model")?);
@@ -48,8 +52,12 @@ pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>, CaptureError> {
 
 /// Reads `images.bin`; the keypoints are skipped.
 pub(super) fn read_images(path: &Path) -> Result<Vec<Image>, CaptureError> {
-    let bytes = read_file(path)?;
-    let mut reader = Reader::new(path, &bytes);
+    parse_images(path, &read_file(path)?)
+}
+
+/// [`read_images`] on the content of the file; `path` is for messages.
+pub(super) fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<Image>, CaptureError> {
+    let mut reader = Reader::new(path, bytes);
     reader.records("image", "images", MIN_IMAGE, |reader, record| {
         let id = reader.u32(record, "id")?;
         let quaternion = reader.f64s(record, "quaternion")?;
@@ -69,8 +77,12 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<Image>, CaptureError> {
 
 /// Reads `points3D.bin`; the tracks are skipped.
 pub(super) fn read_points(path: &Path) -> Result<Vec<Point>, CaptureError> {
-    let bytes = read_file(path)?;
-    let mut reader = Reader::new(path, &bytes);
+    parse_points(path, &read_file(path)?)
+}
+
+/// [`read_points`] on the content of the file; `path` is for messages.
+pub(super) fn parse_points(path: &Path, bytes: &[u8]) -> Result<Vec<Point>, CaptureError> {
+    let mut reader = Reader::new(path, bytes);
     reader.records("point", "points", MIN_POINT, |reader, record| {
         reader.take::<8>(record, "id")?;
         let position = reader.f64s(record, "position")?;

@@ -8,8 +8,13 @@ use super::{CaptureError, Point};
 
 /// Reads `cameras.txt`: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`.
 pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>, CaptureError> {
-    let text = read_file(path)?;
-    records(&text)
+    parse_cameras(path, &read_file(path)?)
+}
+
+/// [`read_cameras`] on the content of the file; `path` is for messages.
+pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<Camera>, CaptureError> {
+    let text = text(path, bytes)?;
+    records(text)
         .map(|(line, record)| {
             let mut fields = Fields::new(path, line, record);
             let id = fields.next("camera id")?;
@@ -40,7 +45,12 @@ pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>, CaptureError> {
 /// Reads `images.txt`: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, then a line of keypoints, which may be empty
 /// and is skipped. The name runs to the end of its line, blanks included.
 pub(super) fn read_images(path: &Path) -> Result<Vec<Image>, CaptureError> {
-    let text = read_file(path)?;
+    parse_images(path, &read_file(path)?)
+}
+
+/// [`read_images`] on the content of the file; `path` is for messages.
+pub(super) fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<Image>, CaptureError> {
+    let text = text(path, bytes)?;
     let mut lines = text.lines().enumerate();
     let mut images = Vec::new();
     while let Some((line, record)) = lines.next() {
@@ -71,8 +81,13 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<Image>, CaptureError> {
 
 /// Reads `points3D.txt`: `POINT3D_ID X Y Z R G B ERROR TRACK[]`; the track is skipped.
 pub(super) fn read_points(path: &Path) -> Result<Vec<Point>, CaptureError> {
-    let text = read_file(path)?;
-    records(&text)
+    parse_points(path, &read_file(path)?)
+}
+
+/// [`read_points`] on the content of the file; `path` is for messages.
+pub(super) fn parse_points(path: &Path, bytes: &[u8]) -> Result<Vec<Point>, CaptureError> {
+    let text = text(path, bytes)?;
+    records(text)
         .map(|(line, record)| {
             let mut fields = Fields::new(path, line, record);
             let _id: u64 = fields.next("point id")?;
@@ -83,10 +98,19 @@ pub(super) fn read_points(path: &Path) -> Result<Vec<Point>, CaptureError> {
         .collect()
 }
 
-fn read_file(path: &Path) -> Result<String, CaptureError> {
-    std::fs::read_to_string(path).map_err(|source| CaptureError::Io {
+fn read_file(path: &Path) -> Result<Vec<u8>, CaptureError> {
+    std::fs::read(path).map_err(|source| CaptureError::Io {
         path: path.to_path_buf(),
         source,
+    })
+}
+
+/// The file as text.
+fn text<'a>(path: &Path, bytes: &'a [u8]) -> Result<&'a str, CaptureError> {
+    std::str::from_utf8(bytes).map_err(|error| CaptureError::BadRecord {
+        path: path.to_path_buf(),
+        record: format!("byte {}", error.valid_up_to()),
+        reason: "it is no UTF-8 text".to_owned(),
     })
 }
 

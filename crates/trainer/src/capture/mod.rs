@@ -13,6 +13,7 @@ mod colmap_text;
 mod downscale;
 mod error;
 mod images;
+pub(crate) mod in_memory;
 mod save;
 mod split;
 
