@@ -248,6 +248,7 @@ fn hash_of(value: &impl Hash) -> u64 {
 
 /// Keeps the present input in a file, which is there after an abort, and ends the process when it takes too long.
 struct Watch {
+    path: PathBuf,
     file: Option<std::fs::File>,
     /// Milliseconds since `start` at which the present input began; 0 between two.
     began: Arc<AtomicU64>,
@@ -260,8 +261,14 @@ impl Watch {
         let (began, start) = (Arc::new(AtomicU64::new(0)), Instant::now());
         let watched = Arc::downgrade(&began);
         let file = std::fs::File::create(&path).ok();
-        std::thread::spawn(move || watch(&watched, start, &path));
-        Self { file, began, start }
+        let watched_path = path.clone();
+        std::thread::spawn(move || watch(&watched, start, &watched_path));
+        Self {
+            path,
+            file,
+            began,
+            start,
+        }
     }
 
     fn begin(&self, input: &Input) {
@@ -294,5 +301,10 @@ fn watch(began: &Weak<AtomicU64>, start: Instant, path: &std::path::Path) {
         }
         std::thread::sleep(Duration::from_millis(500));
     }
-    let _ = std::fs::remove_file(path);
+}
+
+impl Drop for Watch {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.path);
+    }
 }

@@ -154,3 +154,6 @@ pub fn check(
     let walk = walk(&fixture.scene, &computed, NEAR);
     Ok(compare(fixture, &computed, precision, walk.near_threshold))
 }
+
+#[cfg(all(test, feature = "cpu"))]
+mod tests;

@@ -1,14 +1,16 @@
 //! How far alpha and transmittance may lie from their exact values in single precision.
 //!
 //! To first order, with u = 2^-24 the largest relative error of one rounding and k u that of a chain of k of them:
+//! four in a sum of four products; a quotient (2.5 units in the last place on a GPU), a product and a sum; in
+//! the inverse Cholesky factor, from quaternion and scales, more than ten, and so many at most in the exponential.
 //!
 //! ```text
-//! p = W mu + t          dp = k u (|W| |mu| + |t|), nothing where every product and sum is a single-precision number
-//! m = f p.x / p.z + c   dm = |f / p.z| (dp.x + |p.x / p.z| dp.z) + k u (|f p.x / p.z| + |c|)
-//! z1 = w11 dx           dz1 = k u |w11 dx| + w11 dm.x
-//! z2 = w21 dx + w22 dy  dz2 = k u (|w21 dx| + |w22 dy|) + |w21| dm.x + w22 dm.y
+//! p = W mu + t          dp = 4 u (|W| |mu| + |t|), nothing where every product and sum is a single-precision number
+//! m = f p.x / p.z + c   dm = |f / p.z| (dp.x + |p.x / p.z| dp.z) + 8 u |f p.x / p.z| + u |c|
+//! z1 = w11 dx           dz1 = 16 u |w11 dx| + w11 dm.x
+//! z2 = w21 dx + w22 dy  dz2 = 16 u (|w21 dx| + |w22 dy|) + |w21| dm.x + w22 dm.y
 //! sigma = |z|^2 / 2     dsigma = |z1| dz1 + |z2| dz2 + (dz1^2 + dz2^2) / 2
-//! alpha = o e^-sigma    dalpha = alpha (dsigma + k u min(sigma, 1))
+//! alpha = o e^-sigma    dalpha = alpha (dsigma + 16 u min(sigma, 1))
 //! T' = T (1 - alpha)    dT' = (1 - alpha) dT + T dalpha + 2 u T
 //! ```
 //!
@@ -18,9 +20,11 @@
 /// Largest relative error of rounding to single precision.
 const UNIT: f64 = f32::EPSILON as f64 / 2.0;
 
-/// Roundings on the longest way to a value, each of up to [`UNIT`]: the screen mean has four of a sum, two divisions of up
-/// to 2.5 units in the last place on a GPU, a product and a sum; the inverse Cholesky factor and the exponential
-/// have no more.
+/// Roundings of the sum of four products that a camera-space coordinate is.
+const SUM: f64 = 4.0;
+/// Roundings from there to a screen mean.
+const QUOTIENT: f64 = 8.0;
+/// Roundings of the inverse Cholesky factor, its products, the exponential.
 const CHAIN: f64 = 16.0;
 
 /// Error of a screen mean in pixels, given the Gaussian's mean, a row-major view matrix and fx, fy, cx, cy.
@@ -30,7 +34,8 @@ pub(super) fn screen_mean(mean: &[f64], viewmat: &[f64], intrinsics: &[f64]) -> 
         sum([row[0] * mean[0], row[1] * mean[1], row[2] * mean[2], row[3]])
     });
     let along = |p: f64, dp: f64, f: f64, c: f64| {
-        (f / z).abs() * (dp + (p / z).abs() * dz) + CHAIN * UNIT * ((f * p / z).abs() + c.abs())
+        let quotient = (f * p / z).abs();
+        (f / z).abs() * (dp + (p / z).abs() * dz) + UNIT * (QUOTIENT * quotient + c.abs())
     };
     [
         along(x, dx, intrinsics[0], intrinsics[2]),
@@ -46,7 +51,7 @@ fn sum(terms: [f64; 4]) -> (f64, f64) {
         exact &= is_single(term) && is_single(total);
     }
     let size: f64 = terms.iter().map(|term| term.abs()).sum();
-    (total, if exact { 0.0 } else { CHAIN * UNIT * size })
+    (total, if exact { 0.0 } else { SUM * UNIT * size })
 }
 
 /// Error of `alpha`, which is the opacity times `e^-sigma`, at (`dx`, `dy`) from the screen mean; `mean` is that of the

@@ -141,6 +141,23 @@ impl TrainConfig {
         if let Some((field, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
             return Some(format!("`{field}` must lie in [0, 1), it is {value}"));
         }
+        if self.density.reset_opacity == 0.0 {
+            return Some(
+                "`density.reset_opacity` must be above 0; nothing would come back from it".into(),
+            );
+        }
+        let sizes = [
+            ("density.grow_gradient", self.density.grow_gradient),
+            ("density.split_scale", self.density.split_scale),
+            ("density.prune_scale", self.density.prune_scale),
+        ];
+        // Infinity is a way to say never.
+        if let Some((field, value)) = sizes.iter().find(|(_, value)| !(*value >= 0.0)) {
+            return Some(format!("`{field}` must be at least 0, it is {value}"));
+        }
+        if let Some(background) = self.background.filter(|b| !b.iter().all(|x| x.is_finite())) {
+            return Some(format!("`background` must be finite, it is {background:?}"));
+        }
         let highest = splat_model::ops::SH_DEGREE_MAX;
         (self.init.sh_degree > highest).then(|| {
             format!(
@@ -148,5 +165,34 @@ impl TrainConfig {
                 self.init.sh_degree
             )
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_that_would_spoil_a_run_are_named() {
+        let problem = |change: &dyn Fn(&mut TrainConfig)| {
+            let mut config = TrainConfig::default();
+            change(&mut config);
+            config.problem().unwrap_or_default()
+        };
+        assert_eq!(problem(&|_| ()), "");
+        for value in [f32::NAN, f32::INFINITY] {
+            let found = problem(&|config| config.background = Some([0.0, value, 0.0]));
+            assert!(found.contains("`background`"), "{found}");
+        }
+        let found = problem(&|config| config.density.grow_gradient = f64::NAN);
+        assert!(found.contains("`density.grow_gradient`"), "{found}");
+        let found = problem(&|config| config.density.prune_scale = -1.0);
+        assert!(found.contains("`density.prune_scale`"), "{found}");
+        let found = problem(&|config| config.density.reset_opacity = 0.0);
+        assert!(found.contains("`density.reset_opacity`"), "{found}");
+        assert_eq!(
+            problem(&|config| config.density.split_scale = f64::INFINITY),
+            ""
+        );
     }
 }
