@@ -5,6 +5,8 @@ pub mod accuracy;
 pub mod capture;
 pub mod cli;
 mod evaluate;
+#[doc(hidden)]
+pub mod fuzzing;
 pub mod gradcheck;
 #[cfg(feature = "cpu")]
 pub mod performance;

@@ -16,12 +16,14 @@
 //! [`write()`] writes binary little endian. [`read()`] also takes ASCII and big endian, properties in any order and of any
 //! number type (such as `double`), and ignores properties and elements it does not know.
 
+mod header;
+
 use std::cell::Cell;
 use std::fs::File;
 use std::io::{BufRead, BufReader, BufWriter, ErrorKind, Write};
 use std::path::Path;
 
-use ply_rs_bw::parser::{Parser, Reader};
+use ply_rs_bw::parser::Parser;
 use ply_rs_bw::ply::{
     ElementDef, Encoding, Header, Property, PropertyAccess, PropertyAccessResult, PropertyDef,
     PropertyType, ScalarType,
@@ -108,15 +110,25 @@ pub fn read(path: &Path) -> Result<SplatData, SceneFileError> {
     };
     let file = File::open(path).map_err(io_error)?;
     let file_len = file.metadata().map_err(io_error)?.len();
-    let mut reader = Reader::new(BufReader::with_capacity(1 << 20, file));
-    let parser = Parser::<Row>::new();
-    let header = parser
-        .read_header(&mut reader)
-        .map_err(|error| SceneFileError::Header {
-            path: path.to_path_buf(),
-            reason: format!("no PLY header: {}", one_line(&error.to_string())),
-        })?;
+    read_from(path, BufReader::with_capacity(1 << 20, file), file_len)
+}
 
+/// [`read()`] on the content of a file; `path` is for messages.
+///
+/// # Errors
+///
+/// Those of [`read()`].
+pub fn parse(path: &Path, bytes: &[u8]) -> Result<SplatData, SceneFileError> {
+    read_from(path, bytes, bytes.len() as u64)
+}
+
+fn read_from(
+    path: &Path,
+    mut reader: impl BufRead,
+    file_len: u64,
+) -> Result<SplatData, SceneFileError> {
+    let header = header::read(path, &mut reader)?;
+    let parser = Parser::<Row>::new();
     let columns = Columns::find(path, &header)?;
     for element in header.elements.values() {
         let mut rows = Rows {
@@ -126,9 +138,12 @@ pub fn read(path: &Path) -> Result<SplatData, SceneFileError> {
             element,
             line: String::new(),
         };
+        if element.properties.is_empty() {
+            continue; // whatever its count, nothing of it is in the file
+        }
         if element.name != "vertex" {
             for index in 0..element.count {
-                rows.next(reader.get_mut(), index)?;
+                rows.next(&mut reader, index)?;
             }
             continue;
         }
@@ -137,7 +152,7 @@ pub fn read(path: &Path) -> Result<SplatData, SceneFileError> {
         let mut scene = columns.empty_scene(element.count.min(most as usize));
         scene.origin = origin(path, &header)?;
         for index in 0..element.count {
-            let row = rows.next(reader.get_mut(), index)?;
+            let row = rows.next(&mut reader, index)?;
             columns
                 .take(&row, &mut scene)
                 .map_err(|column| SceneFileError::NotFinite {
@@ -328,7 +343,13 @@ impl Rows<'_> {
                 }
             }
         }
-        Ok(row)
+        match (words.next(), self.element.properties.last()) {
+            (Some(word), Some((name, _))) => Err((
+                name,
+                format!("is followed by `{word}`, of which the header knows nothing"),
+            )),
+            _ => Ok(row),
+        }
     }
 
     /// Name of the property in column `column`.

@@ -133,13 +133,6 @@ pub(super) fn judge(
     };
     let report = compare(&fixture, ours, Precision::F32, walked.near_threshold);
     let (worst_group, gradient) = report.worst_group();
-    let mut failed: Vec<_> = report
-        .groups
-        .iter()
-        .filter(|g| !g.pass)
-        .map(|g| g.name)
-        .collect();
-    failed.extend(report.outputs.iter().filter(|o| !o.pass).map(|o| o.name));
     let forward = report.outputs.iter().map(|output| output.rel_l2);
     let outcome = Outcome {
         forward: forward.max_by(f64::total_cmp).unwrap_or(0.0),
@@ -154,7 +147,7 @@ pub(super) fn judge(
         format!(
             "{}: {} beyond {:.0e}",
             scene.source.display(),
-            failed.join(", "),
+            report.failed().join(", "),
             report.gate
         ),
     )

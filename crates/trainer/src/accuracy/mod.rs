@@ -17,3 +17,5 @@ mod sketch;
 pub use case::Case;
 pub use cases::cases;
 pub use measure::{AccuracyError, Outcome};
+#[cfg(test)]
+pub(crate) use sketch::{Sketch, neighbours};

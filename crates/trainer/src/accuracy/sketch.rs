@@ -12,7 +12,7 @@ const SH_C0: f64 = 0.282_094_791_773_878_14;
 
 /// One Gaussian of a sketch.
 #[derive(Debug, Clone)]
-pub(super) struct Blob {
+pub(crate) struct Blob {
     /// World.
     pub mean: DVec3,
     /// (w, x, y, z)
@@ -25,7 +25,7 @@ pub(super) struct Blob {
 }
 
 /// A scene in the making: one pinhole camera, and splats before it.
-pub(super) struct Sketch {
+pub(crate) struct Sketch {
     pub name: &'static str,
     pub size: ImageSize,
     /// fx, fy, cx, cy.
@@ -226,7 +226,7 @@ pub(super) fn about_z(angle: f64) -> [f64; 4] {
 }
 
 /// The next single up, and the next one down.
-pub(super) fn neighbours(value: f64) -> [f64; 2] {
+pub(crate) fn neighbours(value: f64) -> [f64; 2] {
     let value = value as f32;
     [f64::from(value.next_down()), f64::from(value.next_up())]
 }

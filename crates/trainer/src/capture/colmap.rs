@@ -46,8 +46,11 @@ pub(super) struct Image {
 impl Image {
     /// World to camera, row-major 4x4, from the normalised quaternion and the translation.
     pub fn viewmat(&self) -> [[f64; 4]; 4] {
-        let length = self.quaternion.iter().map(|q| q * q).sum::<f64>().sqrt();
-        let [w, x, y, z] = self.quaternion.map(|q| q / length);
+        // By the largest component first, so that the squares neither vanish nor overflow.
+        let largest = self.quaternion.iter().fold(0.0, |m: f64, q| m.max(q.abs()));
+        let scaled = self.quaternion.map(|q| q / largest);
+        let length = scaled.iter().map(|q| q * q).sum::<f64>().sqrt();
+        let [w, x, y, z] = scaled.map(|q| q / length);
         let [tx, ty, tz] = self.translation;
         [
             [
@@ -121,37 +124,58 @@ const MOST_NAME: usize = 4096;
 pub(super) fn read(root: &Path) -> Result<(SparseModel, Vec<CaptureWarning>), CaptureError> {
     let (folder, mut warnings) = find_folder(root)?;
     let files = ModelFiles::find(&folder)?;
-    let (cameras, images, points) = if files.binary {
-        (
-            colmap_binary::read_cameras(&files.cameras)?,
-            colmap_binary::read_images(&files.images)?,
-            colmap_binary::read_points(&files.points)?,
-        )
-    } else {
-        read_text(&files, &mut warnings)?
-    };
-    let model = assemble(&files, cameras, images, points)?;
+    let [cameras, images, points] = [&files.cameras, &files.images, &files.points].map(|path| {
+        std::fs::read(path).map_err(|source| CaptureError::Io {
+            path: path.clone(),
+            source,
+        })
+    });
+    let model = parse(&files, [&cameras?, &images?, &points?], &mut warnings)?;
     Ok((model, warnings))
 }
 
-type Lists = (Vec<Camera>, Vec<Image>, Vec<Point>);
-
-fn read_text(
+/// Reads and checks a model from the content of its cameras, images and points.
+fn parse(
     files: &ModelFiles,
+    [cameras, images, points]: [&[u8]; 3],
     warnings: &mut Vec<CaptureWarning>,
-) -> Result<Lists, CaptureError> {
-    let [cameras, images, points] = [&files.cameras, &files.images, &files.points];
-    let text = colmap_text::read_file(cameras)?;
-    let read_cameras = colmap_text::parse_cameras(cameras, &text)?;
-    let text = colmap_text::read_file(images)?;
-    let read_images = colmap_text::parse_images(images, &text)?;
-    let text = colmap_text::read_file(points)?;
-    let read_points = colmap_text::parse_points(points, &text)?;
-    Ok((
-        read_cameras.checked(cameras, "cameras", warnings),
-        read_images.checked(images, "images", warnings),
-        read_points.checked(points, "points", warnings),
-    ))
+) -> Result<SparseModel, CaptureError> {
+    let (cameras, images, points) = if files.binary {
+        (
+            colmap_binary::parse_cameras(&files.cameras, cameras)?,
+            colmap_binary::parse_images(&files.images, images)?,
+            colmap_binary::parse_points(&files.points, points)?,
+        )
+    } else {
+        (
+            colmap_text::parse_cameras(&files.cameras, cameras)?.checked(
+                &files.cameras,
+                "cameras",
+                warnings,
+            ),
+            colmap_text::parse_images(&files.images, images)?.checked(
+                &files.images,
+                "images",
+                warnings,
+            ),
+            colmap_text::parse_points(&files.points, points)?.checked(
+                &files.points,
+                "points",
+                warnings,
+            ),
+        )
+    };
+    assemble(files, cameras, images, points)
+}
+
+/// [`read`] of a model that lies in memory: the content of its cameras, images and points.
+pub(super) fn parse_model(
+    binary: bool,
+    files: [&[u8]; 3],
+) -> Result<(SparseModel, Vec<CaptureWarning>), CaptureError> {
+    let mut warnings = Vec::new();
+    let model = parse(&ModelFiles::of(Path::new(""), binary), files, &mut warnings)?;
+    Ok((model, warnings))
 }
 
 /// The folder that holds the model.
@@ -211,17 +235,7 @@ impl ModelFiles {
     /// The binary files if all are there, else the text files; otherwise names the missing one of the encoding that
     /// has the cameras.
     fn find(folder: &Path) -> Result<Self, CaptureError> {
-        let of = |binary: bool| {
-            let file =
-                |stem: &str| folder.join(format!("{stem}.{}", if binary { "bin" } else { "txt" }));
-            Self {
-                binary,
-                cameras: file("cameras"),
-                images: file("images"),
-                points: file("points3D"),
-            }
-        };
-        let [binary, text] = [of(true), of(false)];
+        let [binary, text] = [true, false].map(|binary| Self::of(folder, binary));
         match (binary.missing(), text.missing()) {
             (None, _) => Ok(binary),
             (_, None) => Ok(text),
@@ -233,6 +247,17 @@ impl ModelFiles {
                 };
                 Err(CaptureError::MissingModelFile { path: path.clone() })
             }
+        }
+    }
+
+    fn of(folder: &Path, binary: bool) -> Self {
+        let extension = if binary { "bin" } else { "txt" };
+        let file = |stem: &str| folder.join(format!("{stem}.{extension}"));
+        Self {
+            binary,
+            cameras: file("cameras"),
+            images: file("images"),
+            points: file("points3D"),
         }
     }
 
@@ -323,6 +348,9 @@ fn check_image(image: &Image, cameras: &HashMap<u32, Camera>, unique: bool) -> R
     if image.name.chars().any(is_odd) || image.name.len() > MOST_NAME {
         return Err("its name is no file's name".to_owned());
     }
+    if !stays_inside(&image.name) {
+        return Err("its name leads out of the folder of photos".to_owned());
+    }
     if !cameras.contains_key(&image.camera_id) {
         return Err(format!(
             "its camera {} is not among the cameras",
@@ -335,12 +363,20 @@ fn check_image(image: &Image, cameras: &HashMap<u32, Camera>, unique: bool) -> R
             image.translation
         ));
     }
-    let squared: f64 = image.quaternion.iter().map(|q| q * q).sum();
-    if !(squared.is_finite() && squared > 0.0) {
+    let rotates = image.quaternion.iter().any(|q| *q != 0.0);
+    if !(rotates && image.quaternion.iter().all(|q| q.is_finite())) {
         return Err(format!(
             "its quaternion {:?} is not a rotation",
             image.quaternion
         ));
     }
     Ok(())
+}
+
+/// Whether a name, in the notation of any system, is that of something in the folder that it is looked for in.
+fn stays_inside(name: &str) -> bool {
+    let has_drive = matches!(name.as_bytes(), [drive, b':', ..] if drive.is_ascii_alphabetic());
+    let from_root = has_drive || name.starts_with(['/', '\\']);
+    let mut steps = name.split(['/', '\\']);
+    !from_root && !name.contains('\0') && !steps.any(|step| step == "..")
 }

@@ -18,9 +18,8 @@ const KEYPOINT: usize = 8 + 8 + 8;
 const TRACK_ENTRY: usize = 4 + 4;
 
 /// Reads `cameras.bin`.
-pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>, CaptureError> {
-    let bytes = read_file(path)?;
-    let mut reader = Reader::new(path, &bytes);
+pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<Camera>, CaptureError> {
+    let mut reader = Reader::new(path, bytes);
     reader.records("camera", "cameras", MIN_CAMERA, |reader, record| {
         let id = reader.u32(record, "id")?;
         let model = model_name(reader.i32(record, "model")?);
@@ -47,9 +46,8 @@ pub(super) fn read_cameras(path: &Path) -> Result<Vec<Camera>, CaptureError> {
 }
 
 /// Reads `images.bin`; the keypoints are skipped.
-pub(super) fn read_images(path: &Path) -> Result<Vec<Image>, CaptureError> {
-    let bytes = read_file(path)?;
-    let mut reader = Reader::new(path, &bytes);
+pub(super) fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<Image>, CaptureError> {
+    let mut reader = Reader::new(path, bytes);
     reader.records("image", "images", MIN_IMAGE, |reader, record| {
         let id = reader.u32(record, "id")?;
         let quaternion = reader.f64s(record, "quaternion")?;
@@ -68,9 +66,8 @@ pub(super) fn read_images(path: &Path) -> Result<Vec<Image>, CaptureError> {
 }
 
 /// Reads `points3D.bin`; the tracks are skipped.
-pub(super) fn read_points(path: &Path) -> Result<Vec<Point>, CaptureError> {
-    let bytes = read_file(path)?;
-    let mut reader = Reader::new(path, &bytes);
+pub(super) fn parse_points(path: &Path, bytes: &[u8]) -> Result<Vec<Point>, CaptureError> {
+    let mut reader = Reader::new(path, bytes);
     reader.records("point", "points", MIN_POINT, |reader, record| {
         reader.take::<8>(record, "id")?;
         let position = reader.f64s(record, "position")?;
@@ -78,13 +75,6 @@ pub(super) fn read_points(path: &Path) -> Result<Vec<Point>, CaptureError> {
         reader.take::<8>(record, "error")?;
         reader.skip_list(record, "track entries", TRACK_ENTRY)?;
         Ok(Point { position, color })
-    })
-}
-
-fn read_file(path: &Path) -> Result<Vec<u8>, CaptureError> {
-    std::fs::read(path).map_err(|source| CaptureError::Io {
-        path: path.to_path_buf(),
-        source,
     })
 }
 

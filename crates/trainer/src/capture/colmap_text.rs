@@ -38,14 +38,6 @@ impl<T> Listed<T> {
     }
 }
 
-/// Reads a file whole.
-pub(super) fn read_file(path: &Path) -> Result<Vec<u8>, CaptureError> {
-    std::fs::read(path).map_err(|source| CaptureError::Io {
-        path: path.to_path_buf(),
-        source,
-    })
-}
-
 /// Parses `cameras.txt`: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`. `path` is for messages.
 pub(super) fn parse_cameras(path: &Path, text: &[u8]) -> Result<Listed<Camera>, CaptureError> {
     let file = File::new(path, text)?;

@@ -13,6 +13,7 @@ mod colmap_text;
 mod downscale;
 mod error;
 mod images;
+pub(crate) mod in_memory;
 mod jpeg;
 mod save;
 mod split;

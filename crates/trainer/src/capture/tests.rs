@@ -559,3 +559,59 @@ fn one_photo_can_be_looked_at_but_not_trained_on() {
     std::fs::write(root.path().join("split.json"), split).unwrap();
     load(root.path()).unwrap().check_trainable().unwrap();
 }
+
+/// A photo is read from the folder of photos, wherever the model says that it lies.
+#[test]
+fn a_name_that_leads_out_of_the_folder_is_refused() {
+    for name in [
+        "../secret.png",
+        "a/../../secret.png",
+        "/etc/passwd",
+        "C:\\photo.png",
+        "..\\secret.png",
+    ] {
+        let message = message_after("images.bin", |model| model.images[3].4 = name.into());
+        assert!(message.contains("image 97"), "{message}");
+        assert!(message.contains("leads out of the folder"), "{message}");
+    }
+    // Dots in a name are only dots.
+    let (root, mut model) = good();
+    model.images[3].4 = "a..b...png".into();
+    model.write_photos(root.path());
+    model.write_binary(&root.path().join("sparse/0"));
+    assert_eq!(load(root.path()).unwrap().views[0].name, "a..b...png");
+}
+
+/// The second one took the place of the first.
+#[test]
+fn two_cameras_of_one_id_are_refused() {
+    let message = message_after("cameras.bin", |model| model.cameras[1].0 = 7);
+    assert!(
+        message.contains("camera 7: its id occurs twice"),
+        "{message}"
+    );
+}
+
+/// Squares of such components vanish or overflow, in part or all of them.
+#[test]
+fn quaternions_of_any_length_are_normalised() {
+    let viewmat = |length: f64| {
+        let (root, mut model) = good();
+        for image in &mut model.images {
+            image.1 = [0.5, -0.1, 0.7, 0.3].map(|q| q * length);
+        }
+        model.write_binary(&root.path().join("sparse/0"));
+        load(root.path()).unwrap().views[0].viewmat
+    };
+    let expected = viewmat(1.0);
+    for length in [1e-300, 1e-161, 1e-158, 1e160, 1e300] {
+        for (row, expected) in viewmat(length).iter().zip(&expected) {
+            for (value, expected) in row.iter().zip(expected) {
+                assert!(
+                    (value - expected).abs() < 1e-15,
+                    "{length}: {value} {expected}"
+                );
+            }
+        }
+    }
+}

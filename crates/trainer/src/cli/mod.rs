@@ -21,6 +21,7 @@ use clap::{Args, Parser, Subcommand};
 pub use device::DeviceChoice;
 pub use failure::Failure;
 pub use gradcheck::{GradcheckArgs, Precision};
+pub(crate) use scene::parse_config;
 
 /// Train, render and inspect Gaussian splats.
 #[derive(Debug, Parser)]

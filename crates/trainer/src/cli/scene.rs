@@ -11,6 +11,9 @@ use splat_model::{Gaussians, RenderSettings, SceneScale, ShPrecision};
 use super::{Failure, GlobalArgs};
 use crate::train::TrainConfig;
 
+/// What has more bytes is no file of settings, and reading it as one could take all memory.
+const LONGEST_CONFIG: usize = 1 << 20;
+
 /// What `--sh-precision` takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum PrecisionChoice {
@@ -56,11 +59,26 @@ pub(super) fn open(
 
 /// Reads a run's settings.
 pub(super) fn read_config(path: &Path) -> Result<TrainConfig, Failure> {
-    let named = |reason: &dyn std::fmt::Display| {
-        let reason = reason.to_string();
-        let words: Vec<_> = reason.split_whitespace().collect();
-        Failure::BadInput(format!("{}: {}", path.display(), words.join(" ")))
-    };
-    let text = std::fs::read_to_string(path).map_err(|error| named(&error))?;
-    toml::from_str(&text).map_err(|error| named(&error))
+    let bytes = std::fs::read(path).map_err(|error| unusable(path, &error))?;
+    parse_config(path, &bytes)
+}
+
+/// [`read_config`] on the content of a file; `path` is for messages.
+pub(crate) fn parse_config(path: &Path, bytes: &[u8]) -> Result<TrainConfig, Failure> {
+    if bytes.len() > LONGEST_CONFIG {
+        let reason = format!(
+            "{} bytes; the settings of a run take a few hundred",
+            bytes.len()
+        );
+        return Err(unusable(path, &reason));
+    }
+    let text = std::str::from_utf8(bytes).map_err(|error| unusable(path, &error))?;
+    toml::from_str(text).map_err(|error| unusable(path, &error))
+}
+
+/// A file and why it cannot be used, in one line.
+fn unusable(path: &Path, reason: &dyn std::fmt::Display) -> Failure {
+    let reason = reason.to_string();
+    let words: Vec<_> = reason.split_whitespace().collect();
+    Failure::BadInput(format!("{}: {}", path.display(), words.join(" ")))
 }

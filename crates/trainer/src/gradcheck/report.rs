@@ -4,6 +4,7 @@ use std::fmt::Write;
 
 use serde_json::{Map, Value, json};
 
+use super::Precision;
 use super::judge::FileReport;
 
 /// A table: one row per file and parameter group, then the pictures.
@@ -61,11 +62,21 @@ fn write_file(text: &mut String, report: &FileReport) -> std::fmt::Result {
             if output.pass { "" } else { "  FAILS" },
         )?;
     }
+    let leaves_out = cfg!(feature = "cpu") && report.precision == Precision::F32;
+    let left_out = if leaves_out && report.near_threshold > 0 {
+        ", left out above: the gradient without them is judged by ours in f64"
+    } else {
+        ""
+    };
     writeln!(
         text,
-        "  {} of {} pixels near a threshold",
+        "  {} of {} pixels near a threshold{left_out}",
         report.near_threshold, report.pixels
-    )
+    )?;
+    for reason in &report.reasons {
+        writeln!(text, "  FAILS: {reason}")?;
+    }
+    Ok(())
 }
 
 fn verdict(pass: bool) -> &'static str {
@@ -105,6 +116,7 @@ fn file_json(report: &FileReport) -> Value {
         "groups": groups,
         "near_threshold": report.near_threshold,
         "pixels": report.pixels,
+        "reasons": report.reasons,
         "pass": report.pass,
     });
     for output in &report.outputs {

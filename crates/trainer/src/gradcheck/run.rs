@@ -75,7 +75,8 @@ pub fn run(
     let quats = upload.leaf::<2>(&inputs.quats, [n, 4]);
     let scales = upload.leaf::<2>(&inputs.scales, [n, 3]);
     let opacities = upload.leaf::<1>(&inputs.opacities, [n]);
-    let sh_coeffs = upload.leaf::<3>(&inputs.sh_coeffs, [n, 16, 3]);
+    let rows = inputs.sh_coeffs.shape[1];
+    let sh_coeffs = upload.leaf::<3>(&inputs.sh_coeffs, [n, rows, 3]);
     let viewmats = upload.leaf::<3>(&inputs.viewmat, [c, 4, 4]);
     let intrinsics = upload.leaf::<2>(&inputs.intrinsics, [c, 4]);
     let background = upload.leaf::<1>(&inputs.background, [3]);

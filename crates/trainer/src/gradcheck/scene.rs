@@ -42,7 +42,7 @@ pub struct Inputs {
     pub scales: Array,
     /// `[N]`.
     pub opacities: Array,
-    /// `[N, 16, 3]`.
+    /// `[N, K, 3]` with K >= (degree + 1)^2.
     pub sh_coeffs: Array,
     /// `[4, 4]` or `[C, 4, 4]`, world to camera.
     pub viewmat: Array,

@@ -1,6 +1,8 @@
 //! The whole state of a run in one safetensors file: the model, the optimiser's moments, the
 //! statistics of density control, and how far it got. A resumed run goes on with the same numbers.
 
+mod check;
+
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -44,13 +46,15 @@ pub enum CheckpointError {
     Optimizer(#[from] RecordError),
 }
 
+/// Name, shape and values.
+type SavedTensor = (String, Vec<usize>, Vec<f32>);
+
 /// The state of a run, on the host.
 #[derive(Debug, Clone)]
 pub struct Checkpoint {
     path: PathBuf,
     meta: Meta,
-    /// By name: shape and values.
-    tensors: Vec<(String, Vec<usize>, Vec<f32>)>,
+    tensors: Vec<SavedTensor>,
     optimizer: Vec<u8>,
 }
 
@@ -153,16 +157,24 @@ impl Checkpoint {
     /// # Errors
     /// When it cannot be read or is not such a file.
     pub fn load(path: &Path) -> Result<Self, CheckpointError> {
-        let format = |reason: String| CheckpointError::Format {
-            path: path.to_path_buf(),
-            reason,
-        };
         let bytes = std::fs::read(path).map_err(|source| CheckpointError::Io {
             path: path.to_path_buf(),
             source,
         })?;
+        Self::parse(path, &bytes)
+    }
+
+    /// [`load`](Self::load) on the content of a file; `path` is for messages.
+    ///
+    /// # Errors
+    /// When it is not such a file, or its parts do not fit together.
+    pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self, CheckpointError> {
+        let format = |reason: String| CheckpointError::Format {
+            path: path.to_path_buf(),
+            reason,
+        };
         let bad = |error: SafeTensorError| format(error.to_string());
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(bad)?;
+        let (_, header) = SafeTensors::read_metadata(bytes).map_err(bad)?;
         let meta = header.metadata().as_ref().and_then(|map| map.get(META));
         let meta = meta.ok_or_else(|| format("it was not written by `splat train`".into()))?;
         let meta: Meta = serde_json::from_str(meta).map_err(|error| format(error.to_string()))?;
@@ -174,8 +186,8 @@ impl Checkpoint {
         }
         let mut tensors = Vec::new();
         let mut optimizer = Vec::new();
-        for (name, view) in SafeTensors::deserialize(&bytes).map_err(bad)?.tensors() {
-            if name == "optimizer" {
+        for (name, view) in SafeTensors::deserialize(bytes).map_err(bad)?.tensors() {
+            if name == "optimizer" && view.dtype() == Dtype::U8 {
                 optimizer = view.data().to_vec();
                 continue;
             }
@@ -192,7 +204,9 @@ impl Checkpoint {
                 .collect();
             tensors.push((name, view.shape().to_vec(), values));
         }
-        check_shapes(&tensors).map_err(format)?;
+        check::tensors(&tensors).map_err(format)?;
+        check::meta(&meta).map_err(format)?;
+        check::optimizer(&optimizer, &meta, &tensors).map_err(format)?;
         Ok(Self {
             path: path.to_path_buf(),
             meta,
@@ -207,6 +221,13 @@ impl Checkpoint {
         state: &mut State,
         device: &Device,
     ) -> Result<Gaussians, CheckpointError> {
+        let (saved, given) = (&self.meta.history.terms, &state.history.terms);
+        if saved != given {
+            return Err(CheckpointError::Format {
+                path: self.path,
+                reason: format!("its run has a loss of {saved:?}, this one of {given:?}"),
+            });
+        }
         let gaussians = Gaussians {
             origin: self.meta.origin,
             means: self.param("means", device)?,
@@ -237,7 +258,7 @@ impl Checkpoint {
         Ok(gaussians)
     }
 
-    fn find(&self, name: &str) -> Option<&(String, Vec<usize>, Vec<f32>)> {
+    fn find(&self, name: &str) -> Option<&SavedTensor> {
         self.tensors.iter().find(|(found, ..)| found == name)
     }
 
@@ -282,30 +303,6 @@ impl Checkpoint {
     }
 }
 
-/// What does not fit together, if anything: every tensor has a row per Gaussian, of the width of its name.
-fn check_shapes(tensors: &[(String, Vec<usize>, Vec<f32>)]) -> Result<(), String> {
-    let means = tensors.iter().find(|(name, ..)| name == "means");
-    let n = match means.map(|(_, shape, _)| shape.as_slice()) {
-        Some([n, 3]) => *n,
-        _ => return Err("tensor `means` of shape [N, 3] is missing".into()),
-    };
-    for (name, shape, _) in tensors {
-        let fits = match (name.as_str(), shape.as_slice()) {
-            ("means" | "log_scales", [rows, 3]) | ("quats", [rows, 4]) => *rows == n,
-            ("opacity_logits" | "density.gradients" | "density.views", [rows]) => *rows == n,
-            ("sh0", [rows, 1, 3]) => *rows == n,
-            ("sh_rest", [rows, 3 | 8 | 15, 3]) => *rows == n,
-            _ => false,
-        };
-        if !fits {
-            return Err(format!(
-                "tensor `{name}` has shape {shape:?} beside {n} means"
-            ));
-        }
-    }
-    Ok(())
-}
-
 fn param_ids(gaussians: &Gaussians) -> Vec<(String, String)> {
     let mut ids = vec![
         ("means", gaussians.means.id),
@@ -324,6 +321,9 @@ fn param_ids(gaussians: &Gaussians) -> Vec<(String, String)> {
         .map(|(name, id)| (name.to_owned(), id.val().to_string()))
         .collect()
 }
+
+#[cfg(all(test, feature = "cpu"))]
+mod tests;
 
 #[cfg(test)]
 impl Checkpoint {

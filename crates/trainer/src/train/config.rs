@@ -127,6 +127,7 @@ impl TrainConfig {
             ("rates.sh_rest", self.rates.sh_rest),
             ("init.scale", self.init.scale),
         ];
+        // Infinity is a way to say never.
         let not_negative = [
             ("density.grow_gradient", self.density.grow_gradient),
             ("density.split_scale", self.density.split_scale),
@@ -165,13 +166,8 @@ impl TrainConfig {
                 "`{field}` must be positive and finite, it is {value}"
             ));
         }
-        if let Some((field, value)) = not_negative
-            .iter()
-            .find(|(_, value)| !(value.is_finite() && *value >= 0.0))
-        {
-            return Some(format!(
-                "`{field}` must be finite and not negative, it is {value}"
-            ));
+        if let Some((field, value)) = not_negative.iter().find(|(_, value)| !(*value >= 0.0)) {
+            return Some(format!("`{field}` must be at least 0, it is {value}"));
         }
         if let Some(color) = self.background
             && !color.iter().all(|channel| channel.is_finite())
@@ -191,5 +187,34 @@ impl TrainConfig {
                 self.init.sh_degree
             )
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn settings_that_would_spoil_a_run_are_named() {
+        let problem = |change: &dyn Fn(&mut TrainConfig)| {
+            let mut config = TrainConfig::default();
+            change(&mut config);
+            config.problem().unwrap_or_default()
+        };
+        assert_eq!(problem(&|_| ()), "");
+        for value in [f32::NAN, f32::INFINITY] {
+            let found = problem(&|config| config.background = Some([0.0, value, 0.0]));
+            assert!(found.contains("`background`"), "{found}");
+        }
+        let found = problem(&|config| config.density.grow_gradient = f64::NAN);
+        assert!(found.contains("`density.grow_gradient`"), "{found}");
+        let found = problem(&|config| config.density.prune_scale = -1.0);
+        assert!(found.contains("`density.prune_scale`"), "{found}");
+        let found = problem(&|config| config.density.reset_opacity = 0.0);
+        assert!(found.contains("`density.reset_opacity`"), "{found}");
+        assert_eq!(
+            problem(&|config| config.density.split_scale = f64::INFINITY),
+            ""
+        );
     }
 }

@@ -306,3 +306,65 @@ fn the_origin_survives_and_a_bad_one_is_refused() {
     let message = error_of(&spoilt).to_string();
     assert!(message.contains("`4500x00`"), "{message}");
 }
+
+/// Of two properties of one name the library keeps one, and reads every value behind it from the wrong place.
+#[test]
+fn a_name_that_occurs_twice_is_refused_whatever_it_names() {
+    let text = ascii(&scene(2, 0), "float");
+    for (line, again) in [
+        (
+            "property float x\n",
+            "property uchar spare\nproperty uchar spare\n",
+        ),
+        (
+            "element vertex 2\n",
+            "element spare 0\nelement spare 0\nproperty int i\n",
+        ),
+    ] {
+        let message =
+            error_of(text.replace(line, &format!("{again}{line}")).as_bytes()).to_string();
+        assert!(message.contains("spare"), "{message}");
+        assert!(message.contains("repeats a name"), "{message}");
+    }
+    // In different elements it is no repetition.
+    let two = "element camera 0\nproperty float x\nelement vertex 2\n";
+    let two = text.replace("element vertex 2\n", two);
+    assert_eq!(
+        parse(Path::new("scene.ply"), two.as_bytes()).unwrap(),
+        scene(2, 0)
+    );
+}
+
+/// Nothing of such an element is in the file: counting to its end took as long as its count says.
+#[test]
+fn an_element_without_properties_takes_no_time() {
+    let folder = TempDir::new().unwrap();
+    write(&file_in(&folder), &scene(2, 1)).unwrap();
+    let bytes = std::fs::read(file_in(&folder)).unwrap();
+    let at = bytes.windows(7).position(|w| w == b"element").unwrap();
+    let (before, after) = bytes.split_at(at);
+    let nothing = format!("element nothing {}\n", u64::MAX);
+    let bytes = [before, nothing.as_bytes(), after].concat();
+    assert_eq!(parse(Path::new("scene.ply"), &bytes).unwrap(), scene(2, 1));
+}
+
+#[test]
+fn a_line_with_more_values_than_the_header_knows_is_refused() {
+    let text = ascii(&scene(2, 0), "float");
+    let message = error_of(text.replacen("2 5 6\n", "2 5 6 7\n", 1).as_bytes()).to_string();
+    assert!(
+        message.contains("Gaussian 0: extra is followed by `7`"),
+        "{message}"
+    );
+}
+
+/// What never ends its header is another kind of file, and not read to its end.
+#[test]
+fn a_header_without_end_is_given_up() {
+    let text = format!(
+        "ply\nformat ascii 1.0\n{}",
+        "comment and so on\n".repeat(100_000)
+    );
+    let message = error_of(text.as_bytes()).to_string();
+    assert!(message.contains("1048576 bytes"), "{message}");
+}

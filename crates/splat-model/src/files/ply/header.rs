@@ -1,0 +1,65 @@
+//! The header of a PLY file, read line by line up to its end.
+
+use std::collections::HashSet;
+use std::io::{BufRead, Read};
+use std::path::Path;
+
+use ply_rs_bw::parser::{Parser, Reader};
+use ply_rs_bw::ply::Header;
+
+use super::{Row, SceneFileError, one_line};
+
+/// Most bytes of a header: hundreds of times what a scene of degree 3 needs. What has more is another kind of file.
+const LONGEST: u64 = 1 << 20;
+
+/// Reads the header and leaves `reader` behind it.
+pub(super) fn read(path: &Path, reader: &mut impl BufRead) -> Result<Header, SceneFileError> {
+    let error = |reason: String| SceneFileError::Header {
+        path: path.to_path_buf(),
+        reason,
+    };
+    let mut text = String::new();
+    let mut lines = reader.take(LONGEST);
+    loop {
+        let start = text.len();
+        let count = lines
+            .read_line(&mut text)
+            .map_err(|failure| error(format!("no PLY header: {failure}")))?;
+        let line = text[start..].trim_end();
+        if count == 0 || line == "end_header" || (start == 0 && line != "ply") {
+            break;
+        }
+    }
+    if text.len() as u64 == LONGEST {
+        return Err(error(format!(
+            "no PLY header: its end is not in the first {LONGEST} bytes"
+        )));
+    }
+    if let Some(line) = repetition(&text) {
+        return Err(error(format!("`{line}` repeats a name of the header")));
+    }
+    Parser::<Row>::new()
+        .read_header(&mut Reader::new(text.as_bytes()))
+        .map_err(|failure| error(format!("no PLY header: {}", one_line(&failure.to_string()))))
+}
+
+/// The first line that repeats the name of an element, or that of a property of its element. The library would keep one
+/// of the two, and read every value behind it from the wrong place.
+fn repetition(header: &str) -> Option<&str> {
+    let (mut elements, mut properties) = (HashSet::new(), HashSet::new());
+    for line in header.lines() {
+        let mut words = line.split_whitespace();
+        let (known, name) = match words.next() {
+            Some("element") => {
+                properties.clear();
+                (&mut elements, words.next())
+            }
+            Some("property") => (&mut properties, words.last()),
+            _ => continue,
+        };
+        if name.is_some_and(|name| !known.insert(name)) {
+            return Some(line.trim());
+        }
+    }
+    None
+}

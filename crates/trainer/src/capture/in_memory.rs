@@ -1,0 +1,45 @@
+//! A capture of grey photos from the content of a model's files, for whoever has no folder: fuzz targets and the tests that
+//! come of them.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use super::colmap::{self, SparseModel};
+use super::{Capture, CaptureError, Split, View, images};
+
+/// Photos have the size of their camera where it is smaller than this.
+const LARGEST_SIDE: u32 = 24;
+
+/// Reads and checks a model, binary or text, from the content of its cameras, images and points.
+///
+/// # Errors
+/// Those of the readers, see [`CaptureError`].
+pub fn parse(binary: bool, files: [&[u8]; 3]) -> Result<Capture, CaptureError> {
+    let (model, warnings) = colmap::parse_model(binary, files)?;
+    let views: Vec<View> = model.images.iter().map(|i| view(&model, i)).collect();
+    Ok(Capture {
+        name: "memory".into(),
+        root: PathBuf::from("memory"),
+        split: Split {
+            train: (0..views.len()).collect(),
+            test: vec![],
+        },
+        views,
+        points: model.points,
+        warnings,
+    })
+}
+
+fn view(model: &SparseModel, image: &colmap::Image) -> View {
+    let camera = &model.cameras[&image.camera_id];
+    let side = |length: u32| length.clamp(images::MIN_SIDE, LARGEST_SIDE);
+    let (width, height) = (side(camera.width), side(camera.height));
+    View {
+        name: image.name.clone(),
+        width,
+        height,
+        intrinsics: camera.intrinsics,
+        viewmat: image.viewmat(),
+        image: Arc::new(vec![128; 3 * width as usize * height as usize]),
+    }
+}

@@ -1,0 +1,310 @@
+//! Runs a target over and over: mutate, run, judge, and keep what reached something new.
+
+use std::collections::HashSet;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::os::unix::fs::FileExt;
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Weak};
+use std::time::{Duration, Instant};
+
+use rand::{RngExt, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
+use crate::coverage::{self, Edges, Reached};
+use crate::formats::{Input, Target};
+use crate::memory::peak_of;
+use crate::mutate;
+
+/// An input that takes longer is taken for one that never ends.
+const LONGEST: Duration = Duration::from_secs(60);
+/// Longest input, in bytes: every fault that needs a longer one needs a small one first.
+const LARGEST: usize = 1 << 16;
+/// Most inputs that are kept to go on from.
+const CORPUS: usize = 4_096;
+
+/// What a campaign has done.
+#[derive(Debug, Clone, Default)]
+pub struct Report {
+    /// Inputs run.
+    pub executions: u64,
+    /// Those that the reader let through.
+    pub accepted: u64,
+    /// Those of them that were handed on.
+    pub followed: u64,
+    /// Different outcomes: messages without their numbers and quotations.
+    pub outcomes: usize,
+    /// Inputs kept.
+    pub corpus: usize,
+    /// Branches, where they are counted.
+    pub edges: Edges,
+    /// Largest peak of memory beyond the constant, over the input's length.
+    pub memory: f64,
+}
+
+/// An input that fails, and how.
+#[derive(Debug)]
+pub struct Failed {
+    /// What went wrong.
+    pub reason: String,
+    /// The input's files.
+    pub files: Vec<PathBuf>,
+}
+
+impl std::fmt::Display for Failed {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "{}; the input is {:?}", self.reason, self.files)
+    }
+}
+
+/// A target under way.
+pub struct Campaign {
+    target: &'static Target,
+    rng: Pcg64Mcg,
+    /// The seeds, and what reached something new.
+    corpus: Vec<Input>,
+    seeds: usize,
+    /// Of the corpus, what the reader lets through.
+    valid: Vec<usize>,
+    reached: Reached,
+    outcomes: HashSet<u64>,
+    watch: Watch,
+    /// So far.
+    pub report: Report,
+}
+
+impl Campaign {
+    /// Begins with the target's seeds, which are run as they are.
+    ///
+    /// # Errors
+    /// When a seed fails, or is not let through: it would be no start.
+    pub fn new(target: &'static Target, seed: u64) -> Result<Self, Failed> {
+        let mut campaign = Self {
+            target,
+            rng: Pcg64Mcg::seed_from_u64(seed),
+            corpus: vec![],
+            seeds: 0,
+            valid: vec![],
+            reached: Reached::default(),
+            outcomes: HashSet::new(),
+            watch: Watch::new(target.name),
+            report: Report::default(),
+        };
+        for input in (target.seeds)() {
+            let accepted = campaign.report.accepted;
+            campaign.execute(&input, true)?;
+            if campaign.report.accepted == accepted {
+                return Err(campaign.failed("a seed is refused".into(), &input));
+            }
+            campaign.valid.push(campaign.corpus.len());
+            campaign.corpus.push(input);
+        }
+        campaign.seeds = campaign.corpus.len();
+        Ok(campaign)
+    }
+
+    /// Runs one new input.
+    ///
+    /// # Errors
+    /// When it fails.
+    pub fn step(&mut self) -> Result<(), Failed> {
+        // What is broken already seldom becomes whole: two of three begin with something valid.
+        let at = match self.rng.random_range(0..3) {
+            0 => mutate::place(&mut self.rng, self.seeds),
+            1 => *mutate::one_of(&mut self.rng, &self.valid),
+            _ => mutate::place(&mut self.rng, self.corpus.len()),
+        };
+        let mut input = self.corpus[at].clone();
+        let more = self.rng.random_bool(0.5);
+        for _ in 0..if more {
+            self.rng.random_range(2..=5)
+        } else {
+            1
+        } {
+            self.mutate(&mut input);
+        }
+        for part in &mut input.0 {
+            part.truncate(LARGEST);
+        }
+        let accepted = self.report.accepted;
+        if self.execute(&input, false)? && self.corpus.len() < CORPUS {
+            if self.report.accepted > accepted {
+                self.valid.push(self.corpus.len());
+            }
+            self.corpus.push(input);
+        }
+        self.report.corpus = self.corpus.len();
+        Ok(())
+    }
+
+    fn mutate(&mut self, input: &mut Input) {
+        let rng = &mut self.rng;
+        if rng.random_bool(0.7) {
+            (self.target.mutate)(input, rng);
+        } else if rng.random_bool(0.1) {
+            let other = mutate::one_of(rng, &self.corpus);
+            let at = mutate::place(rng, input.0.len());
+            input.0[at].clone_from(&other.0[at]);
+        } else {
+            let at = mutate::place(rng, input.0.len());
+            mutate::bytes(&mut input.0[at], rng);
+        }
+    }
+
+    /// Runs an input; says whether it did something new. What is let through is handed on now and then, or always.
+    ///
+    /// # Errors
+    /// When it fails.
+    pub fn execute(&mut self, input: &Input, always: bool) -> Result<bool, Failed> {
+        self.watch.begin(input);
+        self.report.executions += 1;
+        coverage::clear();
+        let (parsed, peak) = peak_of(|| catch_unwind(|| (self.target.parse)(input)));
+        let news = self.reached.add();
+        let Ok(parsed) = parsed else {
+            return Err(self.failed("the reader panics".into(), input));
+        };
+        let len: usize = input.0.iter().map(Vec::len).sum();
+        let memory = &self.target.memory;
+        let per_byte = peak.saturating_sub(memory.constant) as f64 / len.max(1) as f64;
+        self.report.memory = self.report.memory.max(per_byte);
+        if per_byte > memory.per_byte as f64 {
+            let reason = format!(
+                "the reader takes {peak} bytes for {len}, more than {} a byte and {}",
+                memory.per_byte, memory.constant
+            );
+            return Err(self.failed(reason, input));
+        }
+        let (outcome, follow) = match parsed {
+            Ok(follow) => ("accepted".to_owned(), Some(follow)),
+            Err(message) => (message, None),
+        };
+        if follow.is_none() && !outcome.contains(self.target.file) {
+            return Err(self.failed(format!("`{outcome}` does not name the file"), input));
+        }
+        let outcome_is_new = self.outcomes.insert(hash_of(&gist(&outcome)));
+        let news = if coverage::is_counted() {
+            news
+        } else {
+            outcome_is_new
+        };
+        self.report.outcomes = self.outcomes.len();
+        if let Some(follow) = follow {
+            self.report.accepted += 1;
+            if always || hash_of(&input.0).is_multiple_of(self.target.follow_every) {
+                self.report.followed += 1;
+                if catch_unwind(AssertUnwindSafe(follow)).is_err() {
+                    return Err(self.failed("what the reader lets through panics".into(), input));
+                }
+            }
+        }
+        self.watch.end();
+        Ok(news)
+    }
+
+    /// The report, with the branches so far.
+    pub fn finish(mut self) -> Report {
+        self.report.edges = self.reached.edges();
+        self.report
+    }
+
+    fn failed(&self, reason: String, input: &Input) -> Failed {
+        let folder = PathBuf::from(concat!(env!("CARGO_MANIFEST_DIR"), "/failures"));
+        let name = format!("{}-{:016x}", self.target.name, hash_of(&input.0));
+        let files: Vec<_> = (0..input.0.len())
+            .map(|part| folder.join(format!("{name}.{part}")))
+            .collect();
+        let written = std::fs::create_dir_all(&folder).and_then(|()| {
+            let mut parts = files.iter().zip(&input.0);
+            parts.try_for_each(|(file, part)| std::fs::write(file, part))
+        });
+        let place = written
+            .err()
+            .map_or_else(String::new, |e| format!(" (not written: {e})"));
+        Failed {
+            reason: format!(
+                "{}: {reason}, at execution {}{place}",
+                self.target.name, self.report.executions
+            ),
+            files,
+        }
+    }
+}
+
+/// The end of a message, without what differs from input to input: numbers, and what is quoted.
+fn gist(message: &str) -> String {
+    let outside: Vec<&str> = message.split(['`', '\'']).step_by(2).collect();
+    let words = outside.concat();
+    let letters: Vec<char> = words.chars().filter(|c| c.is_alphabetic()).collect();
+    letters[letters.len().saturating_sub(60)..].iter().collect()
+}
+
+fn hash_of(value: &impl Hash) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    value.hash(&mut hasher);
+    hasher.finish()
+}
+
+/// Keeps the present input in a file, which is there after an abort, and ends the process when it takes too long.
+struct Watch {
+    path: PathBuf,
+    file: Option<std::fs::File>,
+    /// Milliseconds since `start` at which the present input began; 0 between two.
+    began: Arc<AtomicU64>,
+    start: Instant,
+}
+
+impl Watch {
+    fn new(name: &'static str) -> Self {
+        let path = std::env::temp_dir().join(format!("splat-fuzz-{name}-{}", std::process::id()));
+        let (began, start) = (Arc::new(AtomicU64::new(0)), Instant::now());
+        let watched = Arc::downgrade(&began);
+        let file = std::fs::File::create(&path).ok();
+        let watched_path = path.clone();
+        std::thread::spawn(move || watch(&watched, start, &watched_path));
+        Self {
+            path,
+            file,
+            began,
+            start,
+        }
+    }
+
+    fn begin(&self, input: &Input) {
+        let since = self.start.elapsed().as_millis() as u64;
+        self.began.store(since.max(1), Ordering::Relaxed);
+        if let Some(file) = &self.file {
+            let bytes = input.0.concat();
+            // Without the file a failure that aborts is repeated by its seed all the same.
+            let _ = file
+                .write_all_at(&bytes, 0)
+                .and_then(|()| file.set_len(bytes.len() as u64));
+        }
+    }
+
+    fn end(&self) {
+        self.began.store(0, Ordering::Relaxed);
+    }
+}
+
+/// Looks at a campaign until it is gone.
+fn watch(began: &Weak<AtomicU64>, start: Instant, path: &std::path::Path) {
+    while let Some(began) = began.upgrade().map(|began| began.load(Ordering::Relaxed)) {
+        let now = start.elapsed().as_millis() as u64;
+        if began > 0 && Duration::from_millis(now.saturating_sub(began)) > LONGEST {
+            eprintln!(
+                "an input takes more than {LONGEST:?}; its parts, joined, are in {}",
+                path.display()
+            );
+            std::process::exit(1);
+        }
+        std::thread::sleep(Duration::from_millis(500));
+    }
+}
+
+impl Drop for Watch {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_file(&self.path);
+    }
+}

@@ -1,0 +1,161 @@
+//! One file per format: valid files to start from, mutations that know the format, and what is run.
+
+mod checkpoint;
+mod colmap;
+mod colmap_binary;
+mod colmap_text;
+mod config;
+mod fixture;
+mod ply;
+mod safetensors;
+
+use std::sync::{Arc, LazyLock};
+
+use burn::tensor::Device;
+use rand_pcg::Pcg64Mcg;
+use splat_trainer::train::Checkpoint;
+use splat_trainer::{Capture, TrainConfig, Trainer};
+
+/// What is run: the content of one file, or of several that belong together.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct Input(pub Vec<Vec<u8>>);
+
+/// What the program would do with what a reader let through.
+pub type Follow = Box<dyn FnOnce()>;
+
+/// A reader to fuzz.
+pub struct Target {
+    /// Its name.
+    pub name: &'static str,
+    /// What every message must contain: the name of the file, or what its files have in common.
+    pub file: &'static str,
+    /// Valid inputs, small.
+    pub seeds: fn() -> Vec<Input>,
+    /// Changes an input as its format suggests.
+    pub mutate: fn(&mut Input, &mut Pcg64Mcg),
+    /// Runs the reader: the message of what it refuses, or what comes next.
+    pub parse: fn(&Input) -> Result<Follow, String>,
+    /// Of what is let through, one in so many is handed on.
+    pub follow_every: u64,
+    /// What the reader may take.
+    pub memory: Memory,
+}
+
+/// A bound of memory: so many bytes for each of the input, and so many in any case.
+#[derive(Debug, Clone, Copy)]
+pub struct Memory {
+    /// Times the input's length. The input itself, which is in memory already, does not count.
+    pub per_byte: usize,
+    /// Bytes in any case.
+    pub constant: usize,
+}
+
+/// Every reader. The bounds of memory are stated here and nowhere else. That of TOML is the library's: every `{a=` begins a
+/// table.
+///
+/// | reader | bytes for each of the file | and |
+/// |---|---|---|
+/// | COLMAP, binary or text | 16 | 8 KiB |
+/// | PLY | 32 | 8 KiB |
+/// | gradient fixture | 16 | 8 KiB |
+/// | checkpoint | 32 | 8 KiB |
+/// | settings (TOML), which are at most 1 MiB | 1,024 | 8 KiB |
+pub static TARGETS: [Target; 6] = [
+    colmap_binary::TARGET,
+    colmap_text::TARGET,
+    ply::TARGET,
+    fixture::TARGET,
+    checkpoint::TARGET,
+    config::TARGET,
+];
+
+/// A bound of so much for each byte and 8 KiB.
+const fn per_byte(per_byte: usize) -> Memory {
+    Memory {
+        per_byte,
+        constant: 8 << 10,
+    }
+}
+
+/// A capture to train on: that of the COLMAP seeds.
+fn capture() -> Arc<Capture> {
+    static CAPTURE: LazyLock<Arc<Capture>> = LazyLock::new(|| {
+        let files = colmap::Model::small().binary();
+        let [cameras, images, points] = [0, 1, 2].map(|part| files.0[part].as_slice());
+        let capture = splat_trainer::fuzzing::parse_capture(true, [cameras, images, points]);
+        Arc::new(capture.expect("the seed is a valid model"))
+    });
+    CAPTURE.clone()
+}
+
+/// Takes some steps of a run, as far as it can be begun: refusing is fine.
+fn train_steps(capture: Arc<Capture>, config: TrainConfig, checkpoint: Option<Checkpoint>) {
+    let mut trainer = Trainer::builder()
+        .capture(capture)
+        .config(config)
+        .device(Device::flex());
+    if let Some(checkpoint) = checkpoint {
+        trainer = trainer.resume(checkpoint);
+    }
+    let mut left = 3;
+    if let Ok(mut trainer) = trainer.build() {
+        // The third may already add and remove Gaussians.
+        while trainer.step().is_ok() && trainer.gaussians().len() < 1_000 && left > 1 {
+            left -= 1;
+        }
+    }
+}
+
+/// Replaces a value somewhere in a JSON text by an odd one, or drops, repeats or renames an entry.
+fn mutate_json(value: &mut serde_json::Value, rng: &mut Pcg64Mcg) {
+    use rand::RngExt;
+    use serde_json::{Value, json};
+
+    use crate::mutate::{WORDS, number, one_of, place, real};
+    let depth_first = rng.random_bool(0.8);
+    match value {
+        Value::Object(map) if depth_first && !map.is_empty() => {
+            let at = place(rng, map.len());
+            let name = map.keys().nth(at).cloned().unwrap_or_default();
+            match rng.random_range(0..12) {
+                0 => {
+                    map.remove(&name);
+                }
+                1 => {
+                    let other = map.keys().nth(place(rng, map.len())).cloned();
+                    let entry = map[&name].clone();
+                    map.insert(other.unwrap_or_default(), entry);
+                }
+                2 => {
+                    let entry = map[&name].clone();
+                    map.insert(format!("{name}{}", one_of(rng, &WORDS)), entry);
+                }
+                _ => mutate_json(&mut map[&name], rng),
+            }
+        }
+        Value::Array(list) if depth_first && !list.is_empty() => {
+            let at = place(rng, list.len());
+            match rng.random_range(0..8) {
+                0 => {
+                    list.remove(at);
+                }
+                1 => list.insert(at, list[at].clone()),
+                2 => {
+                    let other = place(rng, list.len());
+                    list.swap(at, other);
+                }
+                _ => mutate_json(&mut list[at], rng),
+            }
+        }
+        other => {
+            *other = match rng.random_range(0..6) {
+                0 => json!(number(rng)),
+                1 => json!(real(rng)),
+                2 => json!(one_of(rng, &WORDS)),
+                3 => json!(number(rng).to_string()),
+                4 => one_of(rng, &[Value::Null, json!(true), json!({})]).clone(),
+                _ => json!([number(rng)]),
+            };
+        }
+    }
+}
