@@ -5,7 +5,7 @@ use burn::tensor::{DType, Device, Tensor, TensorData};
 use splat_ops::device::reads_half;
 use splat_ops::{OpError, Projected, SH_DEGREE_MAX, exp, sh_coefficient_count, sh_colors, sigmoid};
 
-use crate::files::SplatData;
+use crate::files::{SceneSettings, SplatData};
 
 /// N Gaussians. Parameters are stored before their activation, as in 3DGS: scales as logarithms,
 /// opacities as logits.
@@ -82,7 +82,8 @@ impl Gaussians {
         }
     }
 
-    /// Reads the values back from the device.
+    /// Reads the values back from the device. How the scene must be rendered is not among them:
+    /// [`SplatData::settings`] is empty.
     pub fn to_data(&self) -> SplatData {
         SplatData {
             origin: self.origin,
@@ -96,6 +97,7 @@ impl Gaussians {
                 .as_ref()
                 .map_or_else(Vec::new, |rest| host(rest.val())),
             sh_degree: self.sh_degree(),
+            settings: SceneSettings::default(),
         }
     }
 
