@@ -12,6 +12,7 @@ use splat_model::{CameraTensors, Gaussians, RenderSettings, project_gaussians, r
 
 use super::{Failure, GlobalArgs, device, scene};
 use crate::report::png::Picture;
+use crate::report::probe_folder;
 use crate::report::progress::Progress;
 
 /// Render pictures of a scene
@@ -77,6 +78,7 @@ pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure>
         } => cameras::of_file(path)?,
         CameraArgs { orbit, .. } => cameras::orbit(&gaussians.to_data(), orbit.unwrap_or(1)),
     };
+    probe_folder(&args.out)?;
     let mut progress = Progress::new(cameras.len() as u64, 0, global.quiet);
     let mut taken = HashSet::new();
     for (done, (name, camera)) in cameras.iter().enumerate() {
