@@ -2,6 +2,7 @@
 
 #[cfg(feature = "cpu")]
 mod bench;
+mod command_line;
 mod device;
 mod eval;
 mod failure;
@@ -10,6 +11,7 @@ mod info;
 mod interrupt;
 mod render;
 mod scene;
+mod text;
 mod train;
 
 use std::io::Write;
