@@ -24,6 +24,8 @@ pub(super) use run::RunRecord;
 const VERSION: u32 = 3;
 /// Key of the metadata entry that holds everything but tensors.
 const META: &str = "burn_splat";
+/// Key of the metadata entry with the checksum of everything else: a number that the disk lost would go on silently.
+const CHECKSUM: &str = "burn_splat_checksum";
 
 /// Why a checkpoint cannot be written or used.
 #[derive(Debug, thiserror::Error)]
@@ -210,7 +212,9 @@ impl Checkpoint {
         let optimizer = TensorView::new(Dtype::U8, length, &self.optimizer).map_err(bad)?;
         views.push(("optimizer", optimizer));
         let meta = serde_json::to_string(&self.meta).map_err(|error| format(error.to_string()))?;
-        let meta = HashMap::from([(META.to_owned(), meta)]);
+        let contents = views.iter().map(|(name, view)| (*name, view.data()));
+        let checksum = checksum(&meta, contents.collect());
+        let meta = HashMap::from([(META.to_owned(), meta), (CHECKSUM.to_owned(), checksum)]);
         let file = safetensors::serialize(views, Some(meta)).map_err(bad)?;
         write_durably(path, &file).map_err(|source| CheckpointError::Io {
             path: path.to_path_buf(),
@@ -241,8 +245,9 @@ impl Checkpoint {
         };
         let bad = |error: SafeTensorError| format(error.to_string());
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(bad)?;
-        let meta = header.metadata().as_ref().and_then(|map| map.get(META));
-        let meta = meta.ok_or_else(|| format("it was not written by `splat train`".into()))?;
+        let entry = |key| header.metadata().as_ref().and_then(|map| map.get(key));
+        let meta =
+            entry(META).ok_or_else(|| format("it was not written by `splat train`".into()))?;
         let json = |error: serde_json::Error| format(error.to_string());
         let Versioned { version } = serde_json::from_str(meta).map_err(json)?;
         if version != VERSION {
@@ -250,10 +255,18 @@ impl Checkpoint {
                 "its format is version {version}, this program reads {VERSION}; go on with the program that wrote it, or begin the run again"
             )));
         }
+        let file = SafeTensors::deserialize(bytes).map_err(bad)?;
+        let contents = file.iter().map(|(name, view)| (name, view.data()));
+        if entry(CHECKSUM) != Some(&checksum(meta, contents.collect())) {
+            return Err(format(
+                "damaged: its checksum is another; go on from a copy, or begin the run again"
+                    .into(),
+            ));
+        }
         let meta: Meta = serde_json::from_str(meta).map_err(json)?;
         let mut tensors = Vec::new();
         let mut optimizer = Vec::new();
-        for (name, view) in SafeTensors::deserialize(bytes).map_err(bad)?.tensors() {
+        for (name, view) in file.tensors() {
             if name == "optimizer" {
                 optimizer = view.data().to_vec();
                 continue;
@@ -359,6 +372,18 @@ impl Checkpoint {
             })?;
         Ok(Param::initialized(ParamId::from(id), value.require_grad()))
     }
+}
+
+/// Checksum of a file's contents: the metadata, then each tensor's name and bytes in the order of the names.
+fn checksum(meta: &str, mut contents: Vec<(&str, &[u8])>) -> String {
+    contents.sort_unstable_by_key(|(name, _)| *name);
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(meta.as_bytes());
+    for (name, bytes) in contents {
+        hasher.update(name.as_bytes());
+        hasher.update(bytes);
+    }
+    hasher.finalize().to_string()
 }
 
 /// What does not fit together, if anything: every tensor has a row per Gaussian, of the width of its name.

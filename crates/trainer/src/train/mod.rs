@@ -790,6 +790,18 @@ mod tests {
         let error = Checkpoint::load(&path).unwrap_err().to_string();
         assert!(error.contains("`quats` has shape"), "{error}");
 
+        // A bit that is lost anywhere is noticed.
+        first.checkpoint().unwrap().save(&path).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        assert!(Checkpoint::parse(&whole, &path).is_ok());
+        for at in (0..whole.len()).step_by(whole.len() / 300) {
+            let mut bytes = whole.clone();
+            bytes[at] ^= 4;
+            let error = Checkpoint::parse(&bytes, &path).unwrap_err().to_string();
+            assert!(error.contains("not a usable checkpoint"), "{error}");
+            assert!(Checkpoint::parse(&whole[..at], &path).is_err());
+        }
+
         std::fs::write(&path, b"something else").unwrap();
         let error = Checkpoint::load(&path).unwrap_err().to_string();
         assert!(error.contains("checkpoint.safetensors"), "{error}");

@@ -163,6 +163,18 @@ fn the_printed_commands_work_when_pasted() {
         "{config}"
     );
 
+    // A name with a line break does not spill its second half into the settings.
+    let broken = "a\nseed = 1\nb";
+    succeed(&small_run(
+        &capture,
+        broken,
+        &["--steps", "1", "--seed", "3"],
+    ));
+    let config_of_broken = folder.path().join(broken).join("config.toml");
+    let again = ["--config", text(&config_of_broken)];
+    succeed(&small_run(&capture, "again", &again));
+    assert_eq!(self::metrics(&folder.path().join("again"))["seed"], 3);
+
     let scene = || fs::read(left.join("scene.ply")).unwrap();
     let (_, repeat) = config.split_once("to repeat: ").unwrap();
     let repeat = repeat.lines().next().unwrap();
@@ -292,10 +304,6 @@ fn the_folder_is_tried_before_the_first_step() {
     let folder = TempDir::new().unwrap();
     let capture = example(folder.path());
     fs::write(folder.path().join("file"), "kept").unwrap();
-    let below = small_run(&capture, "file/below", &["--steps", "2"]);
-    assert_eq!(below.status.code(), Some(2));
-    assert!(stderr(&below).contains("file/below: a file is in the place of a folder"));
-
     for name in ["scene.ply", "metrics.json", "checkpoint.safetensors"] {
         let out = folder.path().join(format!("with {name}"));
         fs::create_dir_all(out.join(name).join("inside")).unwrap();
@@ -305,6 +313,10 @@ fn the_folder_is_tried_before_the_first_step() {
         assert!(said.contains(name), "{said}");
         assert_eq!(fs::read_dir(&out).unwrap().count(), 1, "{said}");
     }
+    let below = small_run(&capture, "file/below", &["--steps", "2"]);
+    assert_eq!(below.status.code(), Some(2));
+    assert!(stderr(&below).contains("file/below: a file is in the place of a folder"));
+
     let out = folder.path().join("views");
     fs::create_dir_all(&out).unwrap();
     fs::write(out.join("views"), "kept").unwrap();
@@ -339,7 +351,10 @@ fn a_full_disk_takes_no_more_than_it_must() {
     let whole = folder.path().join("whole");
     let scene = fs::metadata(whole.join("scene.ply")).unwrap().len();
 
-    // Room for a scene, not for a checkpoint: every autosave fails, and is told once.
+    // Room for a scene, not for a checkpoint.
+    let run = training(&capture, "no_autosave", &[&SMALL[..], &steps].concat());
+    succeed(&limited(&run, scene * 3 / 2).output().unwrap());
+    // Every autosave fails, and is told once.
     let run = training(
         &capture,
         "scene",
@@ -443,8 +458,8 @@ fn a_scenes_settings_stay_with_the_scene() {
     // Another run, whose settings are others, says what it replaces.
     let output = small_run(&capture, "out", &steps);
     succeed(&output);
-    assert!(stderr(&output).contains("out: the results of an earlier run are replaced"));
     assert_eq!(eval(&first).0, table);
+    assert!(stderr(&output).contains("out: the results of an earlier run are replaced"));
     fs::remove_file(out.join("config.toml")).unwrap();
     assert_eq!(eval(&first).0, table);
 
