@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use super::ReportError;
 
 /// Replaces the file `path` by `contents`; folders on the way are made. After a crash of the machine it may be empty:
-/// for what can be made again.
+/// for what can be made again. A device or a pipe is written to.
 ///
 /// # Errors
 ///
@@ -27,6 +27,18 @@ pub fn write_durably(path: &Path, contents: &[u8]) -> std::io::Result<()> {
 }
 
 fn replace(path: &Path, contents: &[u8], durably: bool) -> std::io::Result<()> {
+    if is_device(path) {
+        return std::fs::OpenOptions::new()
+            .write(true)
+            .open(path)?
+            .write_all(contents);
+    }
+    // The file that a link points to, not the link.
+    let linked = path
+        .is_symlink()
+        .then(|| path.canonicalize().ok())
+        .flatten();
+    let path = linked.as_deref().unwrap_or(path);
     let folder = folder_of(path);
     std::fs::create_dir_all(folder)?;
     // On the same file system as its place, so that the rename is one step.
@@ -81,6 +93,9 @@ pub fn probe_folder(folder: &Path) -> Result<(), ReportError> {
 ///
 /// [`ReportError::Io`], naming the file, or its folder.
 pub fn probe_file(path: &Path) -> Result<(), ReportError> {
+    if is_device(path) {
+        return Ok(());
+    }
     if path.is_dir() {
         return Err(ReportError::Io {
             path: path.to_path_buf(),
@@ -91,6 +106,29 @@ pub fn probe_file(path: &Path) -> Result<(), ReportError> {
         });
     }
     probe_folder(folder_of(path))
+}
+
+/// [`probe_file`] of every path that is there.
+///
+/// # Errors
+///
+/// Of the first that cannot be written.
+pub fn probe_files<'a>(
+    paths: impl IntoIterator<Item = &'a Option<PathBuf>>,
+) -> Result<(), ReportError> {
+    paths
+        .into_iter()
+        .flatten()
+        .try_for_each(|path| probe_file(path))
+}
+
+/// Whether this is a pipe, a terminal, or another thing that is written to and never replaced, such as `/dev/stdout`.
+fn is_device(path: &Path) -> bool {
+    let special = |kind: std::fs::Metadata| !kind.is_file() && !kind.is_dir();
+    // What is there may lead to a file, which then is not to be replaced either. `/dev/shm` is a folder like others.
+    let devices = ["/dev", "/dev/fd"].map(|folder| Some(Path::new(folder)));
+    let device = cfg!(unix) && devices.contains(&path.parent()) && path.exists() && !path.is_dir();
+    device || std::fs::metadata(path).is_ok_and(special)
 }
 
 /// The folder of a file.
@@ -133,20 +171,6 @@ fn readable_by_all(builder: &mut tempfile::Builder<'_, '_>) {
 #[cfg(not(unix))]
 fn readable_by_all(_: &mut tempfile::Builder<'_, '_>) {}
 
-/// The first of these files that cannot be written, and why; `None` entries are passed over.
-///
-/// # Errors
-///
-/// As those of [`probe_file`].
-pub fn probe_files<'a>(
-    paths: impl IntoIterator<Item = &'a Option<PathBuf>>,
-) -> Result<(), ReportError> {
-    paths
-        .into_iter()
-        .flatten()
-        .try_for_each(|path| probe_file(path))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -169,6 +193,42 @@ mod tests {
         // Neither beside the good file nor beside the blocked one is anything else.
         assert_eq!(std::fs::read_dir(&blocked).unwrap().count(), 1);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn pipes_are_written_to_and_links_followed() {
+        use std::os::unix::fs::FileTypeExt;
+        let folder = tempfile::TempDir::new().unwrap();
+        let pipe = folder.path().join("pipe");
+        let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+        assert!(made.unwrap().success());
+        probe_file(&pipe).unwrap();
+        let reader = std::thread::spawn({
+            let pipe = pipe.clone();
+            move || {
+                let mut file = std::fs::File::options()
+                    .read(true)
+                    .write(true)
+                    .open(pipe)
+                    .unwrap();
+                let mut read = [0; 5];
+                std::io::Read::read_exact(&mut file, &mut read).unwrap();
+                read
+            }
+        });
+        write(&pipe, b"bytes").unwrap();
+        let kind = std::fs::symlink_metadata(&pipe).unwrap().file_type();
+        assert!(kind.is_fifo(), "the pipe was replaced by a file");
+        assert_eq!(&reader.join().unwrap(), b"bytes");
+
+        let [file, link] = ["file", "link"].map(|name| folder.path().join(name));
+        std::fs::write(&file, b"old").unwrap();
+        std::os::unix::fs::symlink("file", &link).unwrap();
+        assert!(is_device("/dev/null".as_ref()) && !is_device("/dev/shm".as_ref()));
+        write(&link, b"new").unwrap();
+        assert!(link.is_symlink());
+        assert_eq!(std::fs::read(&file).unwrap(), b"new");
     }
 
     #[test]

@@ -85,7 +85,8 @@ pub(super) fn refuse_unfinished(out: &Path, resumed: Option<&Path>) -> Result<()
         (Ok(other), Ok(path)) => other == path,
         _ => false,
     };
-    if !path.exists() || resumed.is_some_and(same) {
+    // A folder in its place is no checkpoint, and told as what it is.
+    if !path.is_file() || resumed.is_some_and(same) {
         return Ok(());
     }
     Err(Failure::BadInput(format!(
