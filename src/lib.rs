@@ -5,7 +5,7 @@
 //! training loop and evaluation. See the repository's `ARCHITECTURE.md` for what is where.
 //!
 //! ```no_run
-//! use burn_splat::model::{Gaussians, RenderSettings, files, render};
+//! use burn_splat::model::{Gaussians, files, render};
 //! use burn_splat::train::{Capture, train::camera};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -14,7 +14,7 @@
 //! let scene = files::ply::read("out/scene.ply".as_ref())?;
 //! let gaussians = Gaussians::from_data(&scene, &device);
 //! let view = camera(&capture.views[0]).tensors(&device);
-//! let settings = RenderSettings { sh_degree: 3, ..Default::default() };
+//! let settings = scene.settings.render_settings(scene.sh_degree);
 //! let image = render(&gaussians, &view, &settings)?.image(); // [1, H, W, 3]
 //! # Ok(()) }
 //! ```

@@ -8,7 +8,7 @@ use splat_ops::{
     sigmoid,
 };
 
-use crate::files::SplatData;
+use crate::files::{SceneSettings, SplatData};
 
 /// N Gaussians. Parameters are stored before their activation, as in 3DGS: scales as logarithms,
 /// opacities as logits.
@@ -85,7 +85,8 @@ impl Gaussians {
         }
     }
 
-    /// Reads the values back from the device.
+    /// Reads the values back from the device. How the scene must be rendered is not among them:
+    /// [`SplatData::settings`] is empty.
     pub fn to_data(&self) -> SplatData {
         SplatData {
             origin: self.origin,
@@ -99,6 +100,7 @@ impl Gaussians {
                 .as_ref()
                 .map_or_else(Vec::new, |rest| host(rest.val())),
             sh_degree: self.sh_degree(),
+            settings: SceneSettings::default(),
         }
     }
 

@@ -88,7 +88,6 @@ pub fn splats_from_points(
     let sh0 = |color: &[u8; 3]| color.map(|channel| ((level(channel) - 0.5) / SH_C0) as f32);
     let opacity = settings.opacity;
     Ok(SplatData {
-        origin: [0.0; 3],
         means: positions.to_vec(),
         log_scales,
         quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
@@ -96,6 +95,7 @@ pub fn splats_from_points(
         sh0: colors.iter().map(sh0).collect(),
         sh_rest: vec![0.0; n * (sh_coefficient_count(settings.sh_degree) - 1) * 3],
         sh_degree: settings.sh_degree,
+        ..SplatData::default()
     })
 }
 

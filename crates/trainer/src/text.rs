@@ -19,6 +19,16 @@ pub(crate) fn without_mark(bytes: &[u8]) -> Result<&[u8], &'static str> {
     Ok(bytes)
 }
 
+/// The text of a file without its byte-order mark.
+///
+/// # Errors
+///
+/// Where in the file there is no text in UTF-8, and what to do.
+pub(crate) fn utf8(bytes: &[u8]) -> Result<&str, String> {
+    std::str::from_utf8(without_mark(bytes)?)
+        .map_err(|error| format!("no text in UTF-8 ({error}); save it as such"))
+}
+
 /// Lines with their index from 0. They end as on Unix or Windows, or as on an old Mac where no other end is found.
 pub(crate) fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, &[u8])> {
     let end = if bytes.contains(&b'\n') { b'\n' } else { b'\r' };

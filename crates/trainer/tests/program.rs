@@ -1,6 +1,10 @@
 //! The `splat` program as its users meet it: what it leaves, that it repeats itself, and what it says to bad input.
 #![cfg(feature = "cpu")]
 
+#[path = "program/runs.rs"]
+#[cfg(unix)]
+mod runs;
+
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};

@@ -1,10 +1,7 @@
 //! Settings of a run, as TOML.
 
-use std::path::Path;
-
 use rand_pcg::Pcg64Mcg;
 use splat_trainer::TrainConfig;
-use splat_trainer::fuzzing::parse_config;
 
 use super::{Follow, Input, Target, capture, per_byte, train_steps};
 use crate::mutate;
@@ -75,7 +72,7 @@ fn seeds() -> Vec<Input> {
 
 /// Reads settings; what is let through begins a run.
 fn parse(input: &Input) -> Result<Follow, String> {
-    let config = parse_config(Path::new("config.toml"), &input.0[0]);
+    let config = TrainConfig::parse(&input.0[0]);
     let config = config.map_err(|error| error.to_string())?;
     Ok(Box::new(move || train_steps(capture(), config, None)))
 }

@@ -302,14 +302,12 @@ mod tests {
     /// Four Gaussians: still, small and growing, large and growing, transparent.
     fn splats() -> SplatData {
         SplatData {
-            origin: [0.0; 3],
             means: vec![[0.0; 3]; 4],
             log_scales: [0.01f32, 0.01, 0.1, 0.01].map(|s| [s.ln(); 3]).to_vec(),
             quats: vec![[1.0, 0.0, 0.0, 0.0]; 4],
             opacity_logits: vec![0.0, 0.0, 0.0, -6.0],
             sh0: vec![[0.0; 3]; 4],
-            sh_rest: Vec::new(),
-            sh_degree: 0,
+            ..SplatData::default()
         }
     }
 

@@ -81,6 +81,18 @@ pub enum SceneFileError {
         /// The value.
         value: f32,
     },
+    /// A setting of the scene that no reader would take.
+    #[error("{}: {setting} is {value}; it must be {must_be}", path.display())]
+    Setting {
+        /// The file.
+        path: PathBuf,
+        /// Name of the setting, as [`SceneSettings`](super::SceneSettings) has it.
+        setting: &'static str,
+        /// The value.
+        value: String,
+        /// What would do.
+        must_be: &'static str,
+    },
     /// Arrays of a scene that do not fit each other.
     #[error("scene: {field} has {len} entries instead of {expected}")]
     Shape {

@@ -8,6 +8,8 @@ mod error;
 
 pub use error::SceneFileError;
 
+use crate::{RenderSettings, SceneScale};
+
 /// A scene as files hold it: plain arrays, one entry per Gaussian, in the parametrisation that is trained.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SplatData {
@@ -29,9 +31,53 @@ pub struct SplatData {
     pub sh_rest: Vec<f32>,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: usize,
+    /// How it must be rendered, as far as that is known.
+    pub settings: SceneSettings,
+}
+
+/// Settings that a scene must be rendered with to look as it did when it was trained. They are part of the scene, and
+/// of its file: `None` where the file does not say.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SceneSettings {
+    /// Size of the scene in world units, which lengths of the renderer count in; positive.
+    pub scene_scale: Option<f64>,
+    /// Whether opacities are multiplied by what the low-pass filter took away.
+    pub antialias: Option<bool>,
+    /// Colour behind the scene, linear RGB; black is zero.
+    pub background: Option<[f32; 3]>,
+    /// What the file says about rendering that this program cannot follow, each in a line; for a warning, and not
+    /// written.
+    pub not_understood: Vec<String>,
+}
+
+impl SceneSettings {
+    /// How to render the scene up to a degree of spherical harmonics: without anti-aliasing and in front of black where the
+    /// settings do not say.
+    pub fn render_settings(&self, sh_degree: usize, scene: SceneScale) -> RenderSettings {
+        RenderSettings {
+            sh_degree,
+            project: scene.project_settings(),
+            antialias: self.antialias.unwrap_or_default(),
+            // Black is what costs nothing.
+            background: self.background.filter(|color| *color != [0.0; 3]),
+            ..RenderSettings::default()
+        }
+    }
 }
 
 impl SplatData {
+    /// Size of the scene: as its settings say, or else as its Gaussians are spread.
+    pub fn scene_scale(&self) -> SceneScale {
+        let said = self.settings.scene_scale.and_then(SceneScale::new);
+        said.unwrap_or_else(|| SceneScale::of_splats(self))
+    }
+
+    /// How to render the scene as it was trained, as far as that is known, up to its degree of spherical harmonics.
+    pub fn render_settings(&self) -> RenderSettings {
+        self.settings
+            .render_settings(self.sh_degree, self.scene_scale())
+    }
+
     /// Number of Gaussians.
     pub fn len(&self) -> usize {
         self.means.len()

@@ -10,12 +10,14 @@
 //! `f_rest_*` runs over the coefficients of red, then of green, then of blue (channel-major; in [`SplatData`] it is
 //! coefficient-major). The normals are written as 0 and not read.
 //!
-//! A scene whose means do not count from the world's zero ([`SplatData::origin`]) says so in a comment,
-//! `comment origin X Y Z`; other programs see it without that offset.
+//! Comments of the header hold the origin and how to render the scene ([`SplatData::settings`]): `ply/comments.rs` has
+//! their form. Other programs see a scene without the offset of its origin.
 //!
 //! [`write()`] writes binary little endian. [`read()`] also takes ASCII and big endian, properties in any order and of any
-//! number type (such as `double`), and ignores properties and elements it does not know.
+//! number type (such as `double`), ignores properties and elements it does not know, and is generous with the header:
+//! `ply/header.rs` has how.
 
+mod comments;
 mod header;
 
 use std::cell::Cell;
@@ -32,15 +34,14 @@ use ply_rs_bw::writer::Writer;
 
 use super::{SceneFileError, SplatData};
 
-/// First word of the comment that holds the origin.
-const ORIGIN: &str = "origin";
-
-/// Writes `scene` to `path`, whole or not at all: beside it first, then renamed.
+/// Writes `scene` to `path`, whole or not at all: beside it first, then renamed. The disk has the new file before it
+/// loses the old one, so that a crash of the machine leaves one of them.
 ///
 /// # Errors
 ///
-/// [`SceneFileError::Shape`] where the arrays of the scene do not fit each other, [`SceneFileError::NotFinite`] where a
-/// value is NaN, or infinite where that means nothing (no reader would take the file), [`SceneFileError::Io`] where the file cannot be written.
+/// [`SceneFileError::Shape`] where the arrays of the scene do not fit each other, [`SceneFileError::NotFinite`] and
+/// [`SceneFileError::Setting`] where a value means nothing and no reader would take it (NaN, or infinite where that means
+/// nothing), [`SceneFileError::Io`] where the file cannot be written.
 pub fn write(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
     scene.check_shape()?;
     let names = property_names(scene.sh_rest_len());
@@ -54,7 +55,9 @@ pub fn write(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
     };
     let mut file = tempfile::Builder::new();
     readable_by_all(&mut file);
-    let file = file.tempfile_in(folder).map_err(io_error)?;
+    let file = file
+        .tempfile_in(folder)
+        .map_err(|error| io_error(without_temporary_name(error)))?;
 
     let mut header = Header::new();
     header.encoding = Encoding::BinaryLittleEndian;
@@ -65,14 +68,11 @@ pub fn write(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
         vertex.properties.insert(name.clone(), property);
     }
     header.elements.insert("vertex".to_owned(), vertex);
-    if scene.origin != [0.0; 3] {
-        let [x, y, z] = scene.origin;
-        header.comments.push(format!("{ORIGIN} {x} {y} {z}"));
-    }
+    header.comments = comments::write(path, scene)?;
     let vertex = &header.elements["vertex"];
 
     let writer = Writer::<Row>::new();
-    let mut out = BufWriter::with_capacity(1 << 20, file);
+    let mut out = BufWriter::with_capacity(1 << 20, file.as_file());
     writer.write_header(&mut out, &header).map_err(io_error)?;
     let mut row = Row::new();
     for index in 0..scene.len() {
@@ -91,9 +91,8 @@ pub fn write(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
             .map_err(io_error)?;
     }
     out.flush().map_err(io_error)?;
-    let file = out
-        .into_inner()
-        .map_err(|error| io_error(error.into_error()))?;
+    drop(out);
+    file.as_file().sync_all().map_err(io_error)?;
     file.persist(path).map_err(|error| io_error(error.error))?;
     Ok(())
 }
@@ -109,8 +108,8 @@ pub fn read(path: &Path) -> Result<SplatData, SceneFileError> {
         source,
     };
     let file = File::open(path).map_err(io_error)?;
-    let file_len = file.metadata().map_err(io_error)?.len();
-    read_from(path, BufReader::with_capacity(1 << 20, file), file_len)
+    let bytes = file.metadata().map_err(io_error)?.len();
+    read_from(path, BufReader::with_capacity(1 << 20, file), bytes)
 }
 
 /// [`read()`] on the content of a file; `path` is for messages.
@@ -125,10 +124,10 @@ pub fn parse(path: &Path, bytes: &[u8]) -> Result<SplatData, SceneFileError> {
 fn read_from(
     path: &Path,
     mut reader: impl BufRead,
-    file_len: u64,
+    bytes: u64,
 ) -> Result<SplatData, SceneFileError> {
-    let header = header::read(path, &mut reader)?;
     let parser = Parser::<Row>::new();
+    let header = header::read(&mut reader, &parser, path)?;
     let columns = Columns::find(path, &header)?;
     for element in header.elements.values() {
         let mut rows = Rows {
@@ -142,15 +141,13 @@ fn read_from(
             continue; // whatever its count, nothing of it is in the file
         }
         if element.name != "vertex" {
-            for index in 0..element.count {
-                rows.next(&mut reader, index)?;
-            }
+            rows.skip(&mut reader)?;
             continue;
         }
         // A damaged count must not become a huge allocation: every property takes at least a byte.
-        let most = file_len / element.properties.len().max(1) as u64;
+        let most = bytes / element.properties.len().max(1) as u64;
         let mut scene = columns.empty_scene(element.count.min(most as usize));
-        scene.origin = origin(path, &header)?;
+        (scene.origin, scene.settings) = comments::read(path, &header.comments)?;
         for index in 0..element.count {
             let row = rows.next(&mut reader, index)?;
             columns
@@ -168,33 +165,6 @@ fn read_from(
     Err(SceneFileError::Empty {
         path: path.to_path_buf(),
     })
-}
-
-/// The origin that the header's comments tell, or zero.
-fn origin(path: &Path, header: &Header) -> Result<[f64; 3], SceneFileError> {
-    let words = |comment: &str| comment.split_whitespace().map(str::to_owned).collect();
-    let mut comments = header.comments.iter().map(|comment| words(comment));
-    let found: Option<Vec<String>> =
-        comments.find(|words: &Vec<String>| words.len() == 4 && words[0] == ORIGIN);
-    let Some(words) = found else {
-        return Ok([0.0; 3]);
-    };
-    let mut origin = [0.0; 3];
-    for (value, word) in origin.iter_mut().zip(&words[1..]) {
-        *value = match word.parse() {
-            Ok(number) if f64::is_finite(number) => number,
-            _ => {
-                return Err(SceneFileError::Header {
-                    path: path.to_path_buf(),
-                    reason: format!(
-                        "comment `{}`: `{word}` is no finite number",
-                        words.join(" ")
-                    ),
-                });
-            }
-        };
-    }
-    Ok(origin)
 }
 
 /// Whether a property may have this value. Infinity is one where it means something: opacity logits of plus and minus
@@ -287,6 +257,16 @@ struct Rows<'a> {
 }
 
 impl Rows<'_> {
+    /// Passes over all of them.
+    fn skip(&mut self, reader: &mut impl BufRead) -> Result<(), SceneFileError> {
+        // Of an element without properties a binary file holds nothing, however many the header announces.
+        let nothing = self.element.properties.is_empty() && self.encoding != Encoding::Ascii;
+        for index in 0..if nothing { 0 } else { self.element.count } {
+            self.next(reader, index)?;
+        }
+        Ok(())
+    }
+
     fn next(&mut self, reader: &mut impl BufRead, index: usize) -> Result<Row, SceneFileError> {
         let row = match self.encoding {
             Encoding::Ascii => return self.next_line(reader, index),
@@ -456,7 +436,6 @@ impl Columns {
 
     fn empty_scene(&self, capacity: usize) -> SplatData {
         SplatData {
-            origin: [0.0; 3],
             means: Vec::with_capacity(capacity),
             log_scales: Vec::with_capacity(capacity),
             quats: Vec::with_capacity(capacity),
@@ -464,6 +443,7 @@ impl Columns {
             sh0: Vec::with_capacity(capacity),
             sh_rest: Vec::with_capacity(capacity * self.sh_rest.len()),
             sh_degree: self.sh_degree,
+            ..SplatData::default()
         }
     }
 
@@ -508,6 +488,15 @@ impl Columns {
 /// The library's messages span lines; ours do not.
 fn one_line(message: &str) -> String {
     message.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// The error without the random name of the temporary file, which says nothing to anybody.
+fn without_temporary_name(error: std::io::Error) -> std::io::Error {
+    let text = error.to_string();
+    match text.split_once(" at path \"") {
+        Some((reason, _)) => std::io::Error::new(error.kind(), reason.to_owned()),
+        None => error,
+    }
 }
 
 /// Temporary files are private by default; the file that replaces the old one should not be.

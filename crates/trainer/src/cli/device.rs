@@ -24,7 +24,6 @@ pub enum DeviceChoice {
 
 impl DeviceChoice {
     /// As it is typed.
-    #[cfg(feature = "cpu")]
     pub(super) fn argument(self) -> &'static str {
         match self {
             Self::Auto => "auto",

@@ -22,6 +22,15 @@ impl Failure {
     }
 }
 
+impl Failure {
+    /// The line without what kind of failure it is.
+    pub(super) fn reason(self) -> String {
+        match self {
+            Self::BadInput(reason) | Self::Check(reason) => reason,
+        }
+    }
+}
+
 impl fmt::Display for Failure {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {

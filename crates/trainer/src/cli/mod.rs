@@ -2,6 +2,7 @@
 
 #[cfg(feature = "cpu")]
 mod bench;
+mod command_line;
 mod device;
 mod eval;
 mod failure;
@@ -11,6 +12,7 @@ mod interrupt;
 mod photos;
 mod render;
 mod scene;
+mod text;
 mod train;
 
 use std::io::Write;
@@ -21,7 +23,6 @@ use clap::{Args, Parser, Subcommand};
 pub use device::DeviceChoice;
 pub use failure::Failure;
 pub use gradcheck::{GradcheckArgs, Precision};
-pub(crate) use scene::parse_config;
 
 /// Train, render and inspect Gaussian splats.
 #[derive(Debug, Parser)]

@@ -13,6 +13,7 @@ use splat_model::{CameraTensors, Gaussians, RenderSettings, project_gaussians, r
 use super::photos::PhotoArgs;
 use super::{Failure, GlobalArgs, device, scene};
 use crate::report::png::Picture;
+use crate::report::probe_folder;
 use crate::report::progress::Progress;
 use crate::report::view_names::ViewNames;
 
@@ -95,6 +96,7 @@ pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure>
         } => cameras::of_file(path)?,
         CameraArgs { orbit, .. } => cameras::orbit(&gaussians.to_data(), orbit.unwrap_or(1)),
     };
+    probe_folder(&args.out)?;
     let mut progress = Progress::new(cameras.len() as u64, 0, global.quiet);
     let suffixes: Vec<&str> = args
         .channels

@@ -4,15 +4,10 @@ use std::path::Path;
 
 use burn::tensor::Device;
 use clap::ValueEnum;
-use splat_model::files::ply;
-use splat_model::ops::SH_DEGREE_MAX;
-use splat_model::{Gaussians, RenderSettings, SceneScale, ShPrecision};
+use splat_model::files::{SceneSettings, ply};
+use splat_model::{Gaussians, RenderSettings, ShPrecision};
 
-use super::{Failure, GlobalArgs};
-use crate::train::TrainConfig;
-
-/// What has more bytes is no file of settings, and reading it as one could take all memory.
-const LONGEST_CONFIG: usize = 1 << 20;
+use super::{Failure, GlobalArgs, text};
 
 /// What `--sh-precision` takes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
@@ -24,29 +19,23 @@ pub enum PrecisionChoice {
     Half,
 }
 
-/// Reads a scene. Scene files do not say whether they were trained with anti-aliasing or in front of a background;
-/// where the run's `config.toml` lies beside the file, it does.
+/// Reads a scene, and how it must be rendered: as its file says. Files of earlier versions, and of other programs, do
+/// not say whether it was trained with anti-aliasing or in front of a background; of those, and only of those, the
+/// run's `config.toml` beside the file is asked, if there is one.
 pub(super) fn open(
     path: &Path,
     device: &Device,
     precision: PrecisionChoice,
     global: &GlobalArgs,
 ) -> Result<(Gaussians, RenderSettings), Failure> {
-    let data = ply::read(path)?;
-    let scene = SceneScale::of_splats(&data);
-    let mut settings = RenderSettings {
-        sh_degree: SH_DEGREE_MAX,
-        project: scene.project_settings(),
-        ..RenderSettings::default()
-    };
-    let config = path.with_file_name("config.toml");
-    if config.is_file() {
-        let config: TrainConfig = read_config(&config)?;
-        settings = config.render_settings(SH_DEGREE_MAX, scene);
-        if config.antialias || config.background.is_some() {
-            global.say("rendering as the config.toml beside the scene says");
-        }
+    let mut data = ply::read(path)?;
+    for comment in &data.settings.not_understood {
+        global.say(format_args!(
+            "warning: {}: not followed: comment `{comment}`",
+            path.display()
+        ));
     }
+    ask_config(path, &mut data.settings, global);
     let mut gaussians = Gaussians::from_data(&data, device);
     if precision == PrecisionChoice::Half {
         gaussians = gaussians.with_sh_precision(ShPrecision::Half);
@@ -54,31 +43,27 @@ pub(super) fn open(
             global.say("rendering exactly: there are no higher degrees that fit half precision, or the device reads none");
         }
     }
-    Ok((gaussians, settings))
+    Ok((gaussians, data.render_settings()))
 }
 
-/// Reads a run's settings.
-pub(super) fn read_config(path: &Path) -> Result<TrainConfig, Failure> {
-    let bytes = std::fs::read(path).map_err(|error| unusable(path, &error))?;
-    parse_config(path, &bytes)
-}
-
-/// [`read_config`] on the content of a file; `path` is for messages.
-pub(crate) fn parse_config(path: &Path, bytes: &[u8]) -> Result<TrainConfig, Failure> {
-    if bytes.len() > LONGEST_CONFIG {
-        let reason = format!(
-            "{} bytes; the settings of a run take a few hundred",
-            bytes.len()
-        );
-        return Err(unusable(path, &reason));
+/// Takes what the scene does not say from the `config.toml` beside it. One that is not a run's is passed over.
+fn ask_config(scene: &Path, settings: &mut SceneSettings, global: &GlobalArgs) {
+    let path = scene.with_file_name("config.toml");
+    let says_all = settings.antialias.is_some() && settings.background.is_some();
+    if says_all || !path.is_file() {
+        return;
     }
-    let text = std::str::from_utf8(bytes).map_err(|error| unusable(path, &error))?;
-    toml::from_str(text).map_err(|error| unusable(path, &error))
-}
-
-/// A file and why it cannot be used, in one line.
-fn unusable(path: &Path, reason: &dyn std::fmt::Display) -> Failure {
-    let reason = reason.to_string();
-    let words: Vec<_> = reason.split_whitespace().collect();
-    Failure::BadInput(format!("{}: {}", path.display(), words.join(" ")))
+    match text::read_config(&path) {
+        Ok(config) => {
+            if config.antialias || config.background.is_some() {
+                global.say("rendering as the config.toml beside the scene says");
+            }
+            settings.antialias.get_or_insert(config.antialias);
+            let background = config.background.unwrap_or_default();
+            settings.background.get_or_insert(background);
+        }
+        Err(failure) => global.say(format_args!(
+            "warning: the config.toml beside the scene is not a run's settings and is passed over ({failure})"
+        )),
+    }
 }

@@ -1,5 +1,8 @@
 //! `splat train`: a scene from photos.
 
+mod results;
+mod resume;
+
 use std::cell::RefCell;
 use std::path::{Path, PathBuf};
 use std::rc::Rc;
@@ -7,31 +10,23 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
-use splat_model::files::ply;
 
+use super::command_line::CommandLine;
 use super::device::ChosenDevice;
 use super::photos::PhotoArgs;
-use super::{Failure, GlobalArgs, device, eval, interrupt, print, scene};
-use crate::capture::{Capture, CaptureOptions, View};
-use crate::report::curves::Curves;
-use crate::report::losses::write_losses;
-use crate::report::memory::peak_rss_bytes;
-use crate::report::metrics::{Metrics, write_json};
-use crate::report::png::Picture;
+use super::{Failure, GlobalArgs, device, eval, interrupt, print, text};
+use crate::capture::{Capture, CaptureOptions};
 use crate::report::progress::Progress;
-use crate::report::view_names::ViewNames;
-use crate::report::{ReportError, write_atomically};
-use crate::train::{Checkpoint, CheckpointError, History, TrainConfig, Trained, Trainer};
-use crate::{Scores, evaluate};
+use crate::train::{Checkpoint, TrainConfig, Trainer, TrainerBuilder};
+use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
+use resume::Interrupted;
 
 /// The held-out views are measured this many times during a run, for the curves.
 const MEASUREMENTS: usize = 10;
 /// The loss shown is the mean over this many steps.
 const LOSS_WINDOW: usize = 50;
-/// Name of the checkpoint in a run's folder.
-const CHECKPOINT: &str = "checkpoint.safetensors";
-/// A crash loses no more than this much training.
-const AUTOSAVE: Duration = Duration::from_secs(60);
+/// A crash loses no more than so many seconds of training, unless `--autosave` says otherwise.
+const AUTOSAVE: u64 = 60;
 
 /// Train a scene from photos
 #[derive(Debug, Args)]
@@ -42,8 +37,12 @@ const AUTOSAVE: Duration = Duration::from_secs(60);
   splat train photos/ --resume out/garden
 
 Writes to DIR: scene.ply, metrics.json, config.toml, curves.svg, losses.csv and views/*.png (truth
-beside render). Ctrl-C finishes the step and writes a checkpoint to resume from; a second Ctrl-C ends
-at once. A checkpoint is also written every minute, so that --resume goes on after a crash.")]
+beside render). Ctrl-C finishes the step, writes the scene and a checkpoint to resume from; a second
+Ctrl-C ends at once. A checkpoint is also written every minute, so that --resume goes on after a crash.
+
+--resume takes the settings of the run from its checkpoint, and refuses another capture, another seed
+and the like. --steps and --max-gaussians may be given anew: they hold from there on, schedules follow
+the new number of steps, and config.toml notes it, for the run cannot be repeated from it alone then.")]
 pub struct TrainArgs {
     /// Capture: a folder with `images/` and `sparse/0/`
     pub capture: PathBuf,
@@ -71,6 +70,9 @@ pub struct TrainArgs {
     /// Go on with the interrupted run in this folder
     #[arg(long, value_name = "DIR", conflicts_with = "config")]
     pub resume: Option<PathBuf>,
+    /// Seconds of training between checkpoints
+    #[arg(long, value_name = "S", default_value_t = AUTOSAVE)]
+    pub autosave: u64,
 }
 
 /// What `--strategy` takes.
@@ -83,14 +85,15 @@ pub enum Strategy {
 
 impl TrainArgs {
     /// The run's settings: the file's (or the interrupted run's, or the defaults), then the arguments'.
-    fn config(&self, global: &GlobalArgs) -> Result<TrainConfig, Failure> {
-        let resumed = self
-            .resume
-            .as_ref()
-            .map(|folder| folder.join("config.toml"));
-        let mut config = match resumed.or_else(|| self.config.clone()) {
-            Some(path) => scene::read_config(&path)?,
-            None => TrainConfig::default(),
+    fn config(
+        &self,
+        resumed: Option<&Interrupted>,
+        global: &GlobalArgs,
+    ) -> Result<TrainConfig, Failure> {
+        let mut config = match (resumed, &self.config) {
+            (Some(run), _) => run.checkpoint.config().clone(),
+            (None, Some(path)) => text::read_config(path)?,
+            (None, None) => TrainConfig::default(),
         };
         let Strategy::Adc = self.strategy;
         config.steps = self.steps.unwrap_or(config.steps);
@@ -98,25 +101,44 @@ impl TrainArgs {
         config.seed = global.seed.unwrap_or(config.seed);
         config.init.sh_degree = self.sh_degree.unwrap_or(config.init.sh_degree);
         config.density.max_gaussians = self.max_gaussians.or(config.density.max_gaussians);
-        match config.problem() {
-            None => Ok(config),
-            Some(problem) => Err(Failure::BadInput(format!("settings: {problem}"))),
+        if let Some(problem) = config.problem() {
+            return Err(Failure::BadInput(format!("settings: {problem}")));
+        }
+        if let Some(run) = resumed {
+            run.checkpoint.check_settings(&config)?;
+        }
+        Ok(config)
+    }
+
+    fn out(&self, resumed: Option<&Interrupted>, capture: &Capture) -> PathBuf {
+        let resumed = || resumed.map(|run| run.folder().to_owned());
+        let given = self.out.clone().or_else(resumed);
+        given.unwrap_or_else(|| Path::new("out").join(&capture.name))
+    }
+
+    /// Adds the folder of the photos, which is no setting of the run, to a command.
+    fn images(&self, line: CommandLine) -> CommandLine {
+        match &self.photos.images {
+            Some(folder) => line.option("--images", folder),
+            None => line,
         }
     }
 
-    fn out(&self, capture: &Capture) -> PathBuf {
-        let given = self.out.clone().or_else(|| self.resume.clone());
-        given.unwrap_or_else(|| Path::new("out").join(&capture.name))
+    /// What to type to go on with the run in `out`. Its settings are in the checkpoint.
+    fn resume_command(&self, out: &Path, global: &GlobalArgs) -> CommandLine {
+        let line = CommandLine::new("train", global).path(&self.capture);
+        let line = self.images(line.option("--resume", out));
+        match self.autosave {
+            AUTOSAVE => line,
+            seconds => line.option("--autosave", seconds.to_string().as_ref()),
+        }
     }
 }
 
 /// Runs the command.
 pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> {
-    let config = args.config(global)?;
-    let checkpoint = match &args.resume {
-        Some(folder) => Some(Checkpoint::load(&folder.join(CHECKPOINT))?),
-        None => None,
-    };
+    let resumed = args.resume.as_deref().map(Interrupted::open).transpose()?;
+    let config = args.config(resumed.as_ref(), global)?;
     let options = CaptureOptions {
         downscale: config.downscale,
         ..args.photos.options()
@@ -129,7 +151,8 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     if let Some(note) = picture_names(&capture).note() {
         global.say(note);
     }
-    let out = args.out(&capture);
+    let out = args.out(resumed.as_ref(), &capture);
+    resume::refuse_unfinished(&out, resumed.as_ref().map(|run| &*run.path))?;
     let chosen = device::open(global)?;
     global.say(format_args!(
         "{}: {} photos to train on, {} held out, {} points",
@@ -138,77 +161,67 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         capture.split.test.len(),
         capture.points.len()
     ));
+    warn_of_settings(resumed.as_ref(), &config, capture.points.len(), global);
 
     // What cannot be written down should be known before the training, not after it.
-    let config_path = out.join("config.toml");
-    let config_text = config_text(&config_path, args, &chosen, &config)?;
-
-    let checkpoint_path = out.join(CHECKPOINT);
-    let save = {
-        let (path, config_path, text) = (
-            checkpoint_path.clone(),
-            config_path.clone(),
-            config_text.clone(),
-        );
-        move |checkpoint: &Checkpoint| {
-            // The settings first: a checkpoint is of no use without them.
-            write_atomically(&config_path, text.as_bytes()).map_err(|source| {
-                CheckpointError::Io {
-                    path: config_path.clone(),
-                    source,
-                }
-            })?;
-            checkpoint.save(&path)
-        }
-    };
-
-    let done = checkpoint.as_ref().map_or(0, Checkpoint::step);
-    let progress = Progress::new(config.steps as u64, done as u64, global.quiet);
-    let progress = Rc::new(RefCell::new(progress));
-    let [shown, noted] = [&progress, &progress].map(Rc::clone);
+    let checkpoint = resumed.map(|run| run.checkpoint);
+    let changes = checkpoint.as_ref().map(|run| run.changes_with(&config));
+    let changes = changes.unwrap_or_default();
+    let config_text = config_text(&out, args, global, &chosen, &config, &changes)?;
+    let fresh = checkpoint.is_none();
     let capture = Arc::new(capture);
+    let progress = Progress::new(
+        config.steps as u64,
+        checkpoint.as_ref().map_or(0, Checkpoint::step) as u64,
+        global.quiet,
+    );
+    let progress = Rc::new(RefCell::new(progress));
     let mut trainer = Trainer::builder()
         .capture(capture.clone())
         .config(config.clone())
         .device(chosen.device.clone())
         .interrupt(interrupt::flag()?)
-        .evaluate_every(config.steps.div_ceil(MEASUREMENTS))
-        .autosave(AUTOSAVE, save.clone())
-        .on_warning(move |warning| noted.borrow().note(&format!("warning: {warning}")))
-        .on_progress(move |state| {
-            shown.borrow_mut().update(state.step as u64, || {
-                let loss = state.history.mean_loss(LOSS_WINDOW);
-                let loss = loss.map_or_else(String::new, |loss| format!("loss {loss:.4}  "));
-                format!("{loss}{} Gaussians", state.gaussians)
-            });
-        });
+        .evaluate_every(config.steps.div_ceil(MEASUREMENTS));
     if let Some(checkpoint) = checkpoint {
         trainer = trainer.resume(checkpoint);
     }
-    let trained = trainer.build()?.run();
+    let file = out.join(CHECKPOINT);
+    let trainer = trainer.autosave(Duration::from_secs(args.autosave), move |checkpoint| {
+        checkpoint.save(&file)
+    });
+    let trainer = shown(trainer, &progress).build()?;
+
+    let resume = args.resume_command(&out, global);
+    let folder = RunFolder {
+        folder: &out,
+        config: &config_text,
+        resume: &resume,
+        global,
+    };
+    folder.probe()?;
+    if fresh && folder.is_taken() {
+        global.say(format_args!(
+            "{}: the results of an earlier run are replaced when this one ends or is interrupted",
+            out.display()
+        ));
+    }
+    let trained = trainer.run();
     progress.borrow().finish();
     let trained = trained?;
 
-    // Before the rest, so that nothing is lost should the rest fail.
-    save(&trained.checkpoint)?;
     if trained.steps < config.steps {
+        folder.interrupted(&trained)?;
         global.say(format_args!(
-            "stopped after {} of {} steps; to go on: splat train {} --resume {}",
-            trained.steps,
-            config.steps,
-            args.capture.display(),
-            out.display()
+            "stopped after {} of {} steps; to go on: {resume}",
+            trained.steps, config.steps
         ));
         return Ok(());
     }
-    let scores = finish(&out, &capture, &config, &chosen, &trained)?;
-    std::fs::remove_file(&checkpoint_path).map_err(|source| ReportError::Io {
-        path: checkpoint_path,
-        source,
-    })?;
-    if !scores.views.is_empty() {
+    let (scores, saved) = folder.complete(&trained, &capture, &config, &chosen);
+    if let Some(scores) = scores.filter(|scores| !scores.views.is_empty()) {
         print(&eval::table(&scores));
     }
+    saved?;
     print(&format!(
         "{} Gaussians after {} steps in {:.1} s, in {}\n",
         trained.gaussians.len(),
@@ -219,99 +232,86 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     Ok(())
 }
 
+/// Lets progress and warnings be seen.
+fn shown(trainer: TrainerBuilder, progress: &Rc<RefCell<Progress>>) -> TrainerBuilder {
+    let [shown, noted] = [progress, progress].map(Rc::clone);
+    trainer
+        .on_warning(move |warning| noted.borrow().note(&format!("warning: {warning}")))
+        .on_progress(move |state| {
+            shown.borrow_mut().update(state.step as u64, || {
+                let loss = state.history.mean_loss(LOSS_WINDOW);
+                let loss = loss.map_or_else(String::new, |loss| format!("loss {loss:.4}  "));
+                format!("{loss}{} Gaussians", state.gaussians)
+            });
+        })
+}
+
+/// Says what of the settings is not as one might think.
+fn warn_of_settings(
+    resumed: Option<&Interrupted>,
+    config: &TrainConfig,
+    points: usize,
+    global: &GlobalArgs,
+) {
+    let warn = |line: std::fmt::Arguments<'_>| global.say(format_args!("warning: {line}"));
+    let (count, what) = match resumed {
+        Some(run) => (
+            run.checkpoint.gaussians(),
+            "Gaussians that the run goes on with",
+        ),
+        None => (points, "points that training starts from"),
+    };
+    if let Some(most) = config.density.max_gaussians.filter(|most| *most < count) {
+        warn(format_args!(
+            "--max-gaussians {most} is below the {count} {what}: all of them are kept, and none is added unless pruning \
+             leaves fewer than {most}"
+        ));
+    }
+    let Some(run) = resumed else { return };
+    for change in run.checkpoint.changes_with(config) {
+        warn(format_args!(
+            "{change}; the run cannot be repeated from its config.toml alone"
+        ));
+    }
+    let path = run.folder().join(CONFIG);
+    let beside = path.is_file().then(|| text::read_config(&path));
+    let difference = match &beside {
+        Some(Ok(beside)) => run.checkpoint.config().difference_in_words(beside),
+        _ => None,
+    };
+    if let Some(difference) = difference {
+        warn(format_args!(
+            "{} is not read: the settings are those of the run's checkpoint ({difference})",
+            path.display()
+        ));
+    }
+}
+
 /// Everything needed to repeat the run, as TOML.
 fn config_text(
-    path: &Path,
+    out: &Path,
     args: &TrainArgs,
+    global: &GlobalArgs,
     chosen: &ChosenDevice,
     config: &TrainConfig,
+    changes: &[String],
 ) -> Result<String, Failure> {
+    let repeat = args.images(CommandLine::new("train", global).path(&args.capture));
+    let repeat = repeat
+        .option("--config", &out.join(CONFIG))
+        .option("--out", out);
+    // A path with a line break would go on outside of the comment.
+    let repeat = repeat
+        .in_a_line()
+        .unwrap_or("splat train --config with this file");
+    let changes: String = changes
+        .iter()
+        .map(|change| format!("# not of the whole run: {change}\n"))
+        .collect();
     Ok(format!(
-        "# splat {} on {}; to repeat: splat train {} --config {}\n{}",
+        "# splat {} on {}; to repeat: {repeat}\n{changes}{}",
         env!("CARGO_PKG_VERSION"),
         chosen.name,
-        args.capture.display(),
-        path.display(),
         toml::to_string(config)?
     ))
-}
-
-/// Writes the scene, its pictures, curves and figures.
-fn finish(
-    out: &Path,
-    capture: &Capture,
-    config: &TrainConfig,
-    chosen: &ChosenDevice,
-    trained: &Trained,
-) -> Result<Scores, Failure> {
-    ply::write(&out.join("scene.ply"), &trained.gaussians.to_data())?;
-    curves(&trained.history).write(&out.join("curves.svg"))?;
-    write_losses(&out.join("losses.csv"), &trained.history)?;
-
-    let views: Vec<&View> = capture.test_views().collect();
-    let names = picture_names(capture);
-    let mut stems = names.stems.iter();
-    let mut written = Ok(());
-    let keep = |view: &View, rendered: Vec<f32>| {
-        // Views come in the order given.
-        if let (Ok(()), Some(stem)) = (&written, stems.next()) {
-            written = write_view(&out.join("views"), stem, view, &rendered);
-        }
-    };
-    let scores = evaluate(
-        &trained.gaussians,
-        &views,
-        &trained.render_settings,
-        &chosen.device,
-        keep,
-    )?;
-    written?;
-
-    let seconds = |time: Duration| time.as_secs_f64();
-    let metrics = Metrics {
-        scores: scores.clone(),
-        gaussians: trained.gaussians.len(),
-        steps: trained.steps,
-        seconds: seconds(trained.elapsed),
-        seconds_per_step: seconds(trained.elapsed) / trained.steps as f64,
-        peak_rss_bytes: peak_rss_bytes(),
-        device_bytes: chosen
-            .device
-            .memory_pool_usage()
-            .map(|usage| usage.bytes_reserved),
-        device: chosen.name.clone(),
-        seed: config.seed,
-    };
-    write_json(&out.join("metrics.json"), &metrics)?;
-    Ok(scores)
-}
-
-/// The names of the held-out views' pictures.
-fn picture_names(capture: &Capture) -> ViewNames {
-    let names = capture.test_views().map(|view| view.name.as_str());
-    ViewNames::new(names, &[""])
-}
-
-/// Truth beside render.
-fn write_view(folder: &Path, stem: &str, view: &View, rendered: &[f32]) -> Result<(), ReportError> {
-    let truth = Picture::from_rgb8(view.width, view.height, view.image.to_vec())?;
-    let render = Picture::from_rgb_f32(view.width, view.height, rendered)?;
-    let path = folder.join(format!("{stem}.png"));
-    truth.beside(&render)?.write(&path)
-}
-
-/// The course of the run: the weighted sum, then each term.
-fn curves(history: &History) -> Curves {
-    let mut curves = Curves {
-        held_out_psnr: history.held_out_psnr.clone(),
-        gaussians: history.counts.clone(),
-        ..Curves::default()
-    };
-    for record in &history.losses {
-        curves.push_loss("loss", record.step, f64::from(record.total));
-        for (name, &value) in history.terms.iter().zip(&record.terms) {
-            curves.push_loss(name, record.step, f64::from(value));
-        }
-    }
-    curves
 }

@@ -1,7 +1,7 @@
 //! What a run leaves behind and shows: pictures, curves, figures, progress.
 //!
 //! Everything is written by [`write_atomically`]: beside its place first, then renamed, so that an interrupted run
-//! leaves either the old file or the new one.
+//! leaves either the old file or the new one; what cannot be made again by [`write_durably`].
 
 mod atomic;
 pub mod curves;
@@ -14,7 +14,7 @@ pub mod view_names;
 
 use std::path::PathBuf;
 
-pub use atomic::write_atomically;
+pub use atomic::{probe_file, probe_files, probe_folder, write_atomically, write_durably};
 
 /// Why a report could not be written. Every message is one line that names the file.
 #[derive(Debug, thiserror::Error)]

@@ -1,7 +1,9 @@
 //! The whole state of a run in one safetensors file: the model, the optimiser's moments, the
-//! statistics of density control, and how far it got. A resumed run goes on with the same numbers.
+//! statistics of density control, how far it got, its settings, and what tells its capture from another. A resumed run
+//! goes on with the same numbers, or not at all.
 
 mod check;
+mod run;
 
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
@@ -15,12 +17,16 @@ use serde::{Deserialize, Serialize};
 use splat_model::Gaussians;
 
 use super::{History, State};
-use crate::report::write_atomically;
+use crate::report::write_durably;
+
+pub(super) use run::RunRecord;
 
 /// File format version; a reader refuses others.
-const VERSION: u32 = 2;
+const VERSION: u32 = 3;
 /// Key of the metadata entry that holds everything but tensors.
 const META: &str = "burn_splat";
+/// Key of the metadata entry with the checksum of everything else: a number that the disk lost would go on silently.
+const CHECKSUM: &str = "burn_splat_checksum";
 
 /// Why a checkpoint cannot be written or used.
 #[derive(Debug, thiserror::Error)]
@@ -41,6 +47,42 @@ pub enum CheckpointError {
         /// What is wrong.
         reason: String,
     },
+    /// The checkpoint of a run on another capture.
+    #[error(
+        "{path}: the run was begun on another capture (`{name}`): {difference}; give the capture it was begun on, or begin another run in another folder"
+    )]
+    OtherCapture {
+        /// The file.
+        path: PathBuf,
+        /// Name of the run's capture.
+        name: String,
+        /// What differs, the first thing.
+        difference: String,
+    },
+    /// The checkpoint of a run with other settings.
+    #[error(
+        "{path}: the run was begun with {difference}; leave that out to go on with the run's settings, or begin another run in another folder"
+    )]
+    OtherSettings {
+        /// The file.
+        path: PathBuf,
+        /// Every such setting, with the two values.
+        difference: String,
+    },
+    /// Nothing would be left to train.
+    #[error(
+        "{path}: {done} of the run's {steps} steps are done; {wanted} would leave nothing to train, ask for more than {done}"
+    )]
+    NothingLeft {
+        /// The file.
+        path: PathBuf,
+        /// Steps done.
+        done: usize,
+        /// Steps of the run.
+        steps: usize,
+        /// Steps asked for.
+        wanted: usize,
+    },
     /// The optimiser's state could not be packed.
     #[error("the optimiser's state cannot be saved: {0}")]
     Optimizer(#[from] RecordError),
@@ -48,6 +90,16 @@ pub enum CheckpointError {
 
 /// Name, shape and values.
 type SavedTensor = (String, Vec<usize>, Vec<f32>);
+
+impl CheckpointError {
+    /// What failures of one kind share, so that a kind is told once.
+    pub(super) fn kind(&self) -> String {
+        match self {
+            Self::Io { path, source } => format!("{} {:?}", path.display(), source.kind()),
+            other => other.to_string(),
+        }
+    }
+}
 
 /// The state of a run, on the host.
 #[derive(Debug, Clone)]
@@ -58,12 +110,20 @@ pub struct Checkpoint {
     optimizer: Vec<u8>,
 }
 
+/// The part of [`Meta`] that all versions have.
+#[derive(Deserialize)]
+struct Versioned {
+    version: u32,
+}
+
 #[derive(Debug, Clone, Serialize, Deserialize)]
 struct Meta {
     version: u32,
     step: usize,
+    run: RunRecord,
     elapsed_seconds: f64,
-    origin: [f64; 3],
+    /// As bits, which JSON does not round.
+    origin_bits: [u64; 3],
     /// Parameter ids, by which the optimiser knows its states; as strings, JSON has no u64.
     param_ids: Vec<(String, String)>,
     edits_seen: Vec<usize>,
@@ -72,7 +132,11 @@ struct Meta {
 
 impl Checkpoint {
     /// The state of a run. The optimiser must have followed all edits of rows.
-    pub(super) fn of(gaussians: &Gaussians, state: &State) -> Result<Self, CheckpointError> {
+    pub(super) fn of(
+        gaussians: &Gaussians,
+        state: &State,
+        run: &RunRecord,
+    ) -> Result<Self, CheckpointError> {
         let data = gaussians.to_data();
         let n = data.len();
         let rest = data.sh_rest_len();
@@ -91,12 +155,13 @@ impl Checkpoint {
             tensors.push(("density.views", vec![n], views));
         }
         Ok(Self {
-            path: PathBuf::new(),
+            path: PathBuf::from("checkpoint"),
             meta: Meta {
                 version: VERSION,
                 step: state.step,
+                run: run.clone(),
                 elapsed_seconds: state.elapsed.as_secs_f64(),
-                origin: gaussians.origin,
+                origin_bits: gaussians.origin.map(f64::to_bits),
                 param_ids: param_ids(gaussians),
                 edits_seen: state.edits.iter().map(|log| log.count()).collect(),
                 history: state.history.clone(),
@@ -114,7 +179,13 @@ impl Checkpoint {
         self.meta.step
     }
 
-    /// Writes the file beside its place and renames it.
+    /// Number of Gaussians.
+    pub fn gaussians(&self) -> usize {
+        self.find("means").map_or(0, |(_, shape, _)| shape[0])
+    }
+
+    /// Writes the file beside its place and renames it, so that a crash, of the machine too, leaves the old one or the
+    /// new one.
     ///
     /// # Errors
     /// When the disk refuses.
@@ -144,9 +215,11 @@ impl Checkpoint {
         let optimizer = TensorView::new(Dtype::U8, length, &self.optimizer).map_err(bad)?;
         views.push(("optimizer", optimizer));
         let meta = serde_json::to_string(&self.meta).map_err(|error| format(error.to_string()))?;
-        let meta = HashMap::from([(META.to_owned(), meta)]);
+        let contents = views.iter().map(|(name, view)| (*name, view.data()));
+        let checksum = checksum(&meta, contents.collect());
+        let meta = HashMap::from([(META.to_owned(), meta), (CHECKSUM.to_owned(), checksum)]);
         let file = safetensors::serialize(views, Some(meta)).map_err(bad)?;
-        write_atomically(path, &file).map_err(|source| CheckpointError::Io {
+        write_durably(path, &file).map_err(|source| CheckpointError::Io {
             path: path.to_path_buf(),
             source,
         })
@@ -175,18 +248,28 @@ impl Checkpoint {
         };
         let bad = |error: SafeTensorError| format(error.to_string());
         let (_, header) = SafeTensors::read_metadata(bytes).map_err(bad)?;
-        let meta = header.metadata().as_ref().and_then(|map| map.get(META));
-        let meta = meta.ok_or_else(|| format("it was not written by `splat train`".into()))?;
-        let meta: Meta = serde_json::from_str(meta).map_err(|error| format(error.to_string()))?;
-        if meta.version != VERSION {
+        let entry = |key| header.metadata().as_ref().and_then(|map| map.get(key));
+        let meta =
+            entry(META).ok_or_else(|| format("it was not written by `splat train`".into()))?;
+        let json = |error: serde_json::Error| format(error.to_string());
+        let Versioned { version } = serde_json::from_str(meta).map_err(json)?;
+        if version != VERSION {
             return Err(format(format!(
-                "version {}, this program reads {VERSION}",
-                meta.version
+                "its format is version {version}, this program reads {VERSION}; go on with the program that wrote it, or begin the run again"
             )));
         }
+        let file = SafeTensors::deserialize(bytes).map_err(bad)?;
+        let contents = file.iter().map(|(name, view)| (name, view.data()));
+        if entry(CHECKSUM) != Some(&checksum(meta, contents.collect())) {
+            return Err(format(
+                "damaged: its checksum is another; go on from a copy, or begin the run again"
+                    .into(),
+            ));
+        }
+        let meta: Meta = serde_json::from_str(meta).map_err(json)?;
         let mut tensors = Vec::new();
         let mut optimizer = Vec::new();
-        for (name, view) in SafeTensors::deserialize(bytes).map_err(bad)?.tensors() {
+        for (name, view) in file.tensors() {
             if name == "optimizer" && view.dtype() == Dtype::U8 {
                 optimizer = view.data().to_vec();
                 continue;
@@ -221,15 +304,8 @@ impl Checkpoint {
         state: &mut State,
         device: &Device,
     ) -> Result<Gaussians, CheckpointError> {
-        let (saved, given) = (&self.meta.history.terms, &state.history.terms);
-        if saved != given {
-            return Err(CheckpointError::Format {
-                path: self.path,
-                reason: format!("its run has a loss of {saved:?}, this one of {given:?}"),
-            });
-        }
         let gaussians = Gaussians {
-            origin: self.meta.origin,
+            origin: self.meta.origin_bits.map(f64::from_bits),
             means: self.param("means", device)?,
             log_scales: self.param("log_scales", device)?,
             quats: self.param("quats", device)?,
@@ -301,6 +377,18 @@ impl Checkpoint {
             })?;
         Ok(Param::initialized(ParamId::from(id), value.require_grad()))
     }
+}
+
+/// Checksum of a file's contents: the metadata, then each tensor's name and bytes in the order of the names.
+fn checksum(meta: &str, mut contents: Vec<(&str, &[u8])>) -> String {
+    contents.sort_unstable_by_key(|(name, _)| *name);
+    let mut hasher = crc32fast::Hasher::new();
+    hasher.update(meta.as_bytes());
+    for (name, bytes) in contents {
+        hasher.update(name.as_bytes());
+        hasher.update(bytes);
+    }
+    hasher.finalize().to_string()
 }
 
 fn param_ids(gaussians: &Gaussians) -> Vec<(String, String)> {

@@ -1,10 +1,16 @@
 //! Everything that determines a training run, apart from the capture and the loss.
 
+use std::collections::BTreeSet;
+
 use serde::{Deserialize, Serialize};
 use splat_model::density::AdaptiveSettings;
 use splat_model::ops::{AdamRows, ClampGradient, RasterizeSettings};
 use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale};
 
+use crate::text::utf8;
+
+/// What has more bytes is no file of settings, and reading it as one could take all memory.
+const LONGEST: usize = 1 << 20;
 /// More would leave no photo anything to see.
 const MOST_HALVINGS: u32 = 8;
 
@@ -70,6 +76,40 @@ impl Default for TrainConfig {
 }
 
 impl TrainConfig {
+    /// Reads a `config.toml`, a byte-order mark before it or not; or says in a line what is wrong with it. What it does
+    /// not name is as by default.
+    ///
+    /// # Errors
+    /// When it is no text, no TOML, or names what is no setting.
+    pub fn parse(bytes: &[u8]) -> Result<Self, String> {
+        if bytes.len() > LONGEST {
+            return Err(format!(
+                "{} bytes; the settings of a run take a few hundred",
+                bytes.len()
+            ));
+        }
+        toml::from_str(utf8(bytes)?).map_err(|error| one_line(&error.to_string()))
+    }
+
+    /// The settings that `other` has otherwise: name, value here, value there, as TOML has them.
+    pub(super) fn differences(&self, other: &Self) -> Vec<(String, String, String)> {
+        let mut found = Vec::new();
+        if let (Ok(here), Ok(there)) = (toml::Table::try_from(self), toml::Table::try_from(other)) {
+            compare("", &here, &there, &mut found);
+        }
+        found
+    }
+
+    /// The settings that `other` has otherwise, in words: `seed = 7, not 8`. Nothing if there is none.
+    pub fn difference_in_words(&self, other: &Self) -> Option<String> {
+        let differences = self.differences(other);
+        let words = differences
+            .iter()
+            .map(|(name, here, there)| format!("{name} = {here}, not {there}"));
+        let words = words.collect::<Vec<_>>().join("; ");
+        (!words.is_empty()).then_some(words)
+    }
+
     /// How to render a scene of this size, up to a degree of spherical harmonics.
     pub fn render_settings(&self, sh_degree: usize, scene: SceneScale) -> RenderSettings {
         RenderSettings {
@@ -190,9 +230,90 @@ impl TrainConfig {
     }
 }
 
+/// Libraries' messages span lines; ours do not.
+fn one_line(message: &str) -> String {
+    message.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
+/// Collects what differs between two tables, of tables in them too.
+fn compare(
+    prefix: &str,
+    here: &toml::Table,
+    there: &toml::Table,
+    found: &mut Vec<(String, String, String)>,
+) {
+    let keys: BTreeSet<&String> = here.keys().chain(there.keys()).collect();
+    for key in keys {
+        let name = format!("{prefix}{key}");
+        match (here.get(key), there.get(key)) {
+            (Some(toml::Value::Table(here)), Some(toml::Value::Table(there))) => {
+                compare(&format!("{name}."), here, there, found);
+            }
+            (here, there) => {
+                // As text, in which NaN equals itself.
+                let [here, there] = [here, there]
+                    .map(|value| value.map_or_else(|| "absent".to_owned(), toml::Value::to_string));
+                if here != there {
+                    found.push((name, here, there));
+                }
+            }
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn settings_are_read_with_and_without_a_byte_order_mark() {
+        let mut config = TrainConfig {
+            steps: 7,
+            background: Some([0.0, 0.1, 1.0]),
+            ..TrainConfig::default()
+        };
+        config.rates.means = 0.1 + 0.2;
+        let text = toml::to_string(&config).unwrap();
+        for text in [
+            text.clone(),
+            format!("\u{FEFF}{text}"),
+            text.replace('\n', "\r\n"),
+        ] {
+            assert_eq!(TrainConfig::parse(text.as_bytes()).as_ref(), Ok(&config));
+        }
+        let utf16: Vec<u8> = "\u{FEFF}seed = 1"
+            .encode_utf16()
+            .flat_map(u16::to_le_bytes)
+            .collect();
+        for (bytes, words) in [
+            (utf16.as_slice(), "UTF-16"),
+            (b"seed = 1 # caf\xe9", "UTF-8"),
+            (b"[package]\nname = \"other\"", "package"),
+            (b"seed = -1", "seed"),
+        ] {
+            let message = TrainConfig::parse(bytes).unwrap_err();
+            assert!(
+                message.contains(words) && !message.contains('\n'),
+                "{message}"
+            );
+        }
+    }
+
+    #[test]
+    fn what_differs_is_named() {
+        let here = TrainConfig::default();
+        let mut there = here.clone();
+        assert_eq!(here.difference_in_words(&there), None);
+        there.seed = 3;
+        there.rates.sh0 *= 2.0;
+        there.density.max_gaussians = Some(5);
+        let words = here.difference_in_words(&there).unwrap();
+        assert!(
+            words.starts_with("density.max_gaussians = absent, not 5; rates.sh0 = "),
+            "{words}"
+        );
+        assert!(words.ends_with("; seed = 0, not 3"), "{words}");
+    }
 
     #[test]
     fn settings_that_would_spoil_a_run_are_named() {

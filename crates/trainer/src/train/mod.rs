@@ -4,6 +4,7 @@
 mod checkpoint;
 mod coarse;
 mod config;
+mod fingerprint;
 mod history;
 mod loss;
 pub(crate) mod views;
@@ -18,6 +19,7 @@ use burn::module::Module;
 use burn::optim::{GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, Transaction};
 use splat_model::density::{AdaptiveDensity, RunShape};
+use splat_model::files::{SceneSettings, SplatData};
 use splat_model::ops::device::keep_awake;
 use splat_model::ops::{OpError, SH_DEGREE_MAX};
 use splat_model::{
@@ -28,9 +30,12 @@ use tracing::trace_span;
 
 use crate::capture::{Capture, CaptureError, View};
 use crate::evaluate::evaluate;
+use checkpoint::RunRecord;
+use fingerprint::Fingerprint;
 
 pub use checkpoint::{Checkpoint, CheckpointError};
 pub use config::TrainConfig;
+
 pub use history::{History, LossRecord};
 pub use loss::{IntoLoss, LossTerms, TargetView};
 pub use views::{camera, photo};
@@ -98,22 +103,50 @@ pub const LOSS_BATCH: usize = 10;
 const NOT_FINITE_LIMIT: usize = 100;
 
 /// What a run leaves.
-#[derive(Debug)]
 pub struct Trained {
     /// The model.
     pub gaussians: Gaussians,
     /// What was logged.
     pub history: History,
-    /// Size of the scene, from which every length of the run followed.
-    pub scene_scale: SceneScale,
     /// How to render the model as it was trained, at its highest degree of spherical harmonics.
     pub render_settings: RenderSettings,
     /// Steps done; fewer than asked for when interrupted.
     pub steps: usize,
     /// Time spent in steps, over all sessions of the run.
     pub elapsed: Duration,
-    /// The state to resume from.
-    pub checkpoint: Checkpoint,
+    /// How the scene must be rendered to look as it did in training.
+    pub settings: SceneSettings,
+    /// As it was trained, with the optimiser's state.
+    state: (Gaussians, State, RunRecord),
+}
+
+impl Trained {
+    /// The scene, with the settings that it must be rendered with.
+    pub fn to_data(&self) -> SplatData {
+        SplatData {
+            settings: self.settings.clone(),
+            ..self.gaussians.to_data()
+        }
+    }
+
+    /// The state to resume from. It is as large again as the scene, and the optimiser's moments twice that.
+    ///
+    /// # Errors
+    /// When the optimiser's state cannot be packed.
+    pub fn checkpoint(&self) -> Result<Checkpoint, CheckpointError> {
+        let (gaussians, state, run) = &self.state;
+        Checkpoint::of(gaussians, state, run)
+    }
+}
+
+impl std::fmt::Debug for Trained {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Trained")
+            .field("gaussians", &self.gaussians.len())
+            .field("steps", &self.steps)
+            .field("elapsed", &self.elapsed)
+            .finish_non_exhaustive()
+    }
 }
 
 /// Builds a [`Trainer`].
@@ -135,6 +168,8 @@ struct Autosave {
     every: Duration,
     last: Instant,
     save: Box<SaveCheckpoint>,
+    /// Kinds of failure that were told.
+    failures: Vec<String>,
 }
 
 /// Puts a checkpoint where it outlives the process.
@@ -172,7 +207,8 @@ impl TrainerBuilder {
         self
     }
 
-    /// Goes on from a checkpoint instead of the capture's points.
+    /// Goes on from a checkpoint instead of the capture's points. The capture must be that of the checkpoint, and so
+    /// must the settings, see [`Checkpoint::check_settings`].
     pub fn resume(mut self, checkpoint: Checkpoint) -> Self {
         self.resume = Some(checkpoint);
         self
@@ -184,7 +220,8 @@ impl TrainerBuilder {
         self
     }
 
-    /// Calls `save` every so often, so that a crash loses no more than that much time. Default: never.
+    /// Calls `save` every so often, so that a crash loses no more than that much time. When it fails the run goes on
+    /// with a warning, one for each kind of failure. Default: never.
     pub fn autosave(
         mut self,
         every: Duration,
@@ -194,6 +231,7 @@ impl TrainerBuilder {
             every,
             last: Instant::now(),
             save: Box::new(save),
+            failures: Vec::new(),
         });
         self
     }
@@ -204,7 +242,7 @@ impl TrainerBuilder {
         self
     }
 
-    /// Called when something looks wrong; [`History::warnings`] keeps it too.
+    /// Called when something looks wrong; [`History::warnings`] keeps what is wrong with the run itself.
     pub fn on_warning(mut self, callback: impl FnMut(&Warning) + 'static) -> Self {
         self.on_warning = Box::new(callback);
         self
@@ -213,8 +251,9 @@ impl TrainerBuilder {
     /// Checks everything and makes the first Gaussians.
     ///
     /// # Errors
-    /// When there is no capture, nothing in it to train on, or a setting is out of range.
-    pub fn build(self) -> Result<Trainer, TrainError> {
+    /// When there is no capture, nothing in it to train on, a setting is out of range, or the checkpoint to resume from
+    /// is another run's.
+    pub fn build(mut self) -> Result<Trainer, TrainError> {
         if let Some(problem) = self.config.problem() {
             return Err(TrainError::Config(problem));
         }
@@ -233,12 +272,24 @@ impl TrainerBuilder {
             seed: self.config.seed,
         };
         let device = self.device.without_autodiff().autodiff();
+        let mut record = RunRecord {
+            capture: Fingerprint::of(&capture),
+            config: self.config.clone(),
+            changes: Vec::new(),
+        };
         let mut config = self.config;
         let most = config.density.max_gaussians;
         config.density.max_gaussians = most.or_else(|| Some(worthwhile_gaussians(&capture)));
         let mut state = State::new(&config, run, &loss);
         let gaussians = match self.resume {
-            Some(checkpoint) => checkpoint.restore(&mut state, &device)?,
+            Some(checkpoint) => {
+                let views = checkpoint.check_run(&record, &state.history.terms)?;
+                if !views.is_empty() {
+                    (self.on_warning)(&Warning::PhotosChanged { views });
+                }
+                record.changes = checkpoint.changes_with(&record.config);
+                checkpoint.restore(&mut state, &device)?
+            }
             None => {
                 let origin = run.scene_scale.origin(&cameras);
                 first_gaussians(&capture, &config, run, origin, &device)?
@@ -261,6 +312,7 @@ impl TrainerBuilder {
             on_warning: self.on_warning,
             gaussians,
             state,
+            record,
             unread: Vec::new(),
             coarse: coarse::CoarseViews::default(),
         })
@@ -350,6 +402,7 @@ pub struct Trainer {
     on_warning: Box<dyn FnMut(&Warning)>,
     gaussians: Gaussians,
     state: State,
+    record: RunRecord,
     unread: Vec<UnreadLoss>,
     coarse: coarse::CoarseViews,
 }
@@ -377,8 +430,8 @@ impl Trainer {
     /// step whose loss is not is a warning, and an error only when many come in a row.
     ///
     /// # Errors
-    /// When the loss is not finite for 100 steps in a row, or for the whole of a shorter run, an op refuses what it is
-    /// given, or a checkpoint cannot be kept.
+    /// When the loss is not finite for 100 steps in a row, or for the whole of a shorter run, or an op refuses what it is
+    /// given.
     pub fn run(mut self) -> Result<Trained, TrainError> {
         if self.state.step == 0 {
             let found = warnings::start::inspect(&self.capture, &self.gaussians, &self.config);
@@ -406,15 +459,20 @@ impl Trainer {
         }
         self.read_losses()?;
         Ok(Trained {
-            checkpoint: Checkpoint::of(&self.gaussians, &self.state)?,
+            settings: SceneSettings {
+                scene_scale: Some(self.run.scene_scale.length()),
+                antialias: Some(self.config.antialias),
+                background: Some(self.config.background.unwrap_or_default()),
+                ..SceneSettings::default()
+            },
             gaussians: self.gaussians.valid(),
-            history: self.state.history,
-            scene_scale: self.run.scene_scale,
+            history: self.state.history.clone(),
             render_settings: self
                 .config
                 .render_settings(SH_DEGREE_MAX, self.run.scene_scale),
             steps: self.state.step,
             elapsed: self.state.elapsed,
+            state: (self.gaussians, self.state, self.record),
         })
     }
 
@@ -435,10 +493,22 @@ impl Trainer {
         }
         // The losses up to here are part of the checkpoint.
         self.read_losses()?;
-        let checkpoint = Checkpoint::of(&self.gaussians, &self.state)?;
-        if let Some(autosave) = &mut self.autosave {
-            (autosave.save)(&checkpoint)?;
-            autosave.last = Instant::now();
+        let Some(autosave) = &mut self.autosave else {
+            return Ok(());
+        };
+        let saved = Checkpoint::of(&self.gaussians, &self.state, &self.record)
+            .and_then(|checkpoint| (autosave.save)(&checkpoint));
+        autosave.last = Instant::now();
+        // Training is worth more than what could not be kept of it. Not part of the history: when the run is resumed
+        // it is news again.
+        if let Err(error) = saved
+            && !autosave.failures.contains(&error.kind())
+        {
+            autosave.failures.push(error.kind());
+            (self.on_warning)(&Warning::NotSaved {
+                step: self.state.step,
+                reason: error.to_string(),
+            });
         }
         Ok(())
     }
@@ -722,7 +792,7 @@ mod tests {
         assert_eq!(first.steps, 105);
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("checkpoint.safetensors");
-        first.checkpoint.save(&path).unwrap();
+        first.checkpoint().unwrap().save(&path).unwrap();
         let checkpoint = Checkpoint::load(&path).unwrap();
         let second = builder().resume(checkpoint).build().unwrap().run().unwrap();
 
@@ -732,11 +802,23 @@ mod tests {
         // Density control must have been part of it.
         assert_ne!(whole.gaussians.len(), capture().points.len());
 
-        let mut damaged = first.checkpoint.clone();
+        let mut damaged = first.checkpoint().unwrap();
         damaged.drop_row("quats");
         damaged.save(&path).unwrap();
         let error = Checkpoint::load(&path).unwrap_err().to_string();
         assert!(error.contains("`quats` has shape"), "{error}");
+
+        // A bit that is lost anywhere is noticed.
+        first.checkpoint().unwrap().save(&path).unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        assert!(Checkpoint::parse(&path, &whole).is_ok());
+        for at in (0..whole.len()).step_by(whole.len() / 300) {
+            let mut bytes = whole.clone();
+            bytes[at] ^= 4;
+            let error = Checkpoint::parse(&path, &bytes).unwrap_err().to_string();
+            assert!(error.contains("not a usable checkpoint"), "{error}");
+            assert!(Checkpoint::parse(&path, &whole[..at]).is_err());
+        }
 
         std::fs::write(&path, b"something else").unwrap();
         let error = Checkpoint::load(&path).unwrap_err().to_string();
@@ -764,6 +846,91 @@ mod tests {
         let resumed = builder().resume(checkpoint).build().unwrap().run().unwrap();
         assert_eq!(resumed.history.losses, whole.history.losses);
         assert!(resumed.gaussians.to_data() == whole.gaussians.to_data());
+    }
+
+    /// What cannot be kept is told once for each kind of failure, and costs nothing of the run.
+    #[test]
+    fn a_run_outlives_its_autosaves() {
+        let said = Rc::new(RefCell::new(Vec::new()));
+        let heard = said.clone();
+        let mut count = 0;
+        let trained = builder()
+            .autosave(Duration::ZERO, move |_| {
+                count += 1;
+                let kind = match count % 3 {
+                    0 => std::io::ErrorKind::StorageFull,
+                    1 => std::io::ErrorKind::PermissionDenied,
+                    _ => return Ok(()),
+                };
+                Err(CheckpointError::Io {
+                    path: "there".into(),
+                    // As where a name differs from time to time.
+                    source: std::io::Error::new(kind, format!("attempt {count}")),
+                })
+            })
+            .on_warning(move |warning| heard.borrow_mut().push(warning.to_string()))
+            .build()
+            .unwrap()
+            .run()
+            .unwrap();
+        assert_eq!(trained.steps, 240);
+        let said = said.borrow();
+        assert_eq!(said.len(), 2, "{said:?}");
+        assert!(said[0].contains("there: attempt 1"), "{said:?}");
+        // The next run that goes on from here is to hear of it again.
+        assert!(trained.history.warnings.is_empty());
+    }
+
+    /// Another run is not gone on with: another capture, other settings, another loss; photos whose pixels alone
+    /// changed are named.
+    #[test]
+    fn a_checkpoint_is_of_one_run() {
+        let first = builder()
+            .interrupt(Arc::new(AtomicBool::new(true)))
+            .build()
+            .unwrap()
+            .run()
+            .unwrap();
+        let checkpoint = first.checkpoint().unwrap();
+        let refusal = |change: &dyn Fn(TrainerBuilder) -> TrainerBuilder| {
+            let built = change(builder().resume(checkpoint.clone())).build();
+            built.err().map(|error| error.to_string())
+        };
+        assert_eq!(refusal(&|builder| builder), None);
+        let mut other = Capture::clone(&capture());
+        other.split.train.pop();
+        let error = refusal(&|builder| builder.capture(Arc::new(other.clone())));
+        assert!(error.unwrap().contains("is not used, it was trained on"));
+        let mut config = first.state.2.config.clone();
+        config.rates.sh0 *= 2.0;
+        config.background = Some([1.0; 3]);
+        let error = refusal(&|builder| builder.config(config.clone())).unwrap();
+        assert!(
+            error.contains("background = absent") && error.contains("rates.sh0"),
+            "{error}"
+        );
+        let error = refusal(&|builder| {
+            builder.loss(|_: &TargetView, rendered: &splat_model::ops::Rendered| {
+                Ok(rendered.alpha().mean())
+            })
+        });
+        assert!(error.unwrap().contains("a loss of the terms"));
+
+        let said = Rc::new(RefCell::new(Vec::new()));
+        let heard = said.clone();
+        let mut other = Capture::clone(&capture());
+        Arc::make_mut(&mut other.views[2].image).fill(9);
+        let name = other.views[2].name.clone();
+        let built = builder()
+            .capture(Arc::new(other))
+            .resume(checkpoint)
+            .on_warning(move |warning| heard.borrow_mut().push(warning.clone()))
+            .build();
+        assert!(built.is_ok());
+        assert_eq!(
+            *said.borrow(),
+            [Warning::PhotosChanged { views: vec![name] }]
+        );
     }
 
     #[test]
@@ -873,7 +1040,7 @@ mod tests {
         // What was said stays with the run, and is not said again.
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("checkpoint.safetensors");
-        trained.checkpoint.save(&path).unwrap();
+        trained.checkpoint().unwrap().save(&path).unwrap();
         let checkpoint = Checkpoint::load(&path).unwrap();
         let resumed = builder()
             .loss(loss)

@@ -76,6 +76,18 @@ pub enum Warning {
         /// Each setting, and how many times its default it is.
         rates: Vec<(String, f64)>,
     },
+    /// Photos of a resumed run whose pixels are not those that it was begun with.
+    PhotosChanged {
+        /// Their names.
+        views: Vec<String>,
+    },
+    /// The state of the run could not be kept.
+    NotSaved {
+        /// Steps done.
+        step: usize,
+        /// Why, in a line that names the file.
+        reason: String,
+    },
     /// The loss of a step was NaN or infinite.
     LossNotFinite {
         /// Name of the photo.
@@ -206,6 +218,15 @@ impl fmt::Display for Warning {
                 }
                 write!(f, "; training may not settle, lower the learning rates")
             }
+            Self::PhotosChanged { views } => write!(
+                f,
+                "{}: the photo has other pixels than the one that the run was begun with; it goes on with those there are now",
+                Names(views)
+            ),
+            Self::NotSaved { step, reason } => write!(
+                f,
+                "at step {step} the run could not be saved: {reason}; it goes on, and tries again"
+            ),
             Self::LossNotFinite { view, step } => write!(
                 f,
                 "{view}: at step {step} the loss is not a finite number; gradients that are not finite are left out, look at the photo, its camera and the loss"

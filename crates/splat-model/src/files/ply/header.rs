@@ -1,4 +1,7 @@
-//! The header of a PLY file, read line by line up to its end.
+//! The header of a PLY file, made plain before it is parsed.
+//!
+//! Headers come from many programs and text editors. A byte-order mark before `ply`, blank lines, indentation, carriage
+//! returns before line feeds, comments before `format`, and comments in another encoding than UTF-8 change nothing.
 
 use std::collections::HashSet;
 use std::io::{BufRead, Read};
@@ -7,40 +10,73 @@ use std::path::Path;
 use ply_rs_bw::parser::{Parser, Reader};
 use ply_rs_bw::ply::Header;
 
-use super::{Row, SceneFileError, one_line};
+use super::super::SceneFileError;
+use super::{Row, one_line};
 
-/// Most bytes of a header: hundreds of times what a scene of degree 3 needs. What has more is another kind of file.
+/// A header is no longer than this many bytes: what is longer is something else.
 const LONGEST: u64 = 1 << 20;
+/// UTF-8's byte-order mark.
+const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
 
-/// Reads the header and leaves `reader` behind it.
-pub(super) fn read(path: &Path, reader: &mut impl BufRead) -> Result<Header, SceneFileError> {
-    let error = |reason: String| SceneFileError::Header {
+/// Reads the header, and leaves `reader` behind it.
+pub(super) fn read(
+    reader: &mut impl BufRead,
+    parser: &Parser<Row>,
+    path: &Path,
+) -> Result<Header, SceneFileError> {
+    let bad = |reason: String| SceneFileError::Header {
         path: path.to_path_buf(),
-        reason,
+        reason: format!("no PLY header: {reason}"),
     };
     let mut text = String::new();
-    let mut lines = reader.take(LONGEST);
+    let mut left = LONGEST;
     loop {
-        let start = text.len();
-        let count = lines
-            .read_line(&mut text)
-            .map_err(|failure| error(format!("no PLY header: {failure}")))?;
-        let line = text[start..].trim_end();
-        if count == 0 || line == "end_header" || (start == 0 && line != "ply") {
+        let mut line = Vec::new();
+        let read = reader.by_ref().take(left).read_until(b'\n', &mut line);
+        let read = read.map_err(|source| SceneFileError::Io {
+            path: path.to_path_buf(),
+            source,
+        })?;
+        left -= read as u64;
+        if left == 0 {
+            return Err(bad(format!("no line `end_header` in {LONGEST} bytes")));
+        }
+        let first = text.is_empty();
+        let bytes = match line.strip_prefix(BYTE_ORDER_MARK) {
+            Some(rest) if first => rest,
+            _ => &line[..],
+        };
+        let line = String::from_utf8_lossy(bytes);
+        let line = line.trim();
+        if first && line != "ply" {
+            return Err(bad(match line.strip_prefix("ply\r") {
+                Some(_) => "its lines end in carriage returns alone; end them in line feeds".into(),
+                None => "it does not begin with the line `ply`".into(),
+            }));
+        }
+        if read == 0 {
+            return Err(bad("it ends without the line `end_header`".into()));
+        }
+        // A blank line counts as one, for the numbers of lines in messages.
+        text += &match line {
+            "" => "comment".to_owned(),
+            line => line.replace('\r', " "),
+        };
+        text.push('\n');
+        if line == "end_header" {
             break;
         }
     }
-    if text.len() as u64 == LONGEST {
-        return Err(error(format!(
-            "no PLY header: its end is not in the first {LONGEST} bytes"
-        )));
-    }
     if let Some(line) = repetition(&text) {
-        return Err(error(format!("`{line}` repeats a name of the header")));
+        return Err(bad(format!("`{line}` repeats a name of the header")));
     }
-    Parser::<Row>::new()
-        .read_header(&mut Reader::new(text.as_bytes()))
-        .map_err(|failure| error(format!("no PLY header: {}", one_line(&failure.to_string()))))
+    let header = parser.read_header(&mut Reader::new(text.as_bytes()));
+    header.map_err(|error| {
+        let message = error.to_string();
+        // What follows is about the grammar, not about the file.
+        let (message, _) = message.split_once("\n\tError:").unwrap_or((&message, ""));
+        bad(one_line(message))
+    })
 }
 
 /// The first line that repeats the name of an element, or that of a property of its element. The library would keep one

@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use tempfile::TempDir;
 
+use super::super::SceneSettings;
 use super::*;
 
 /// A scene whose every value is another one.
@@ -291,20 +292,231 @@ fn arrays_that_do_not_fit_are_named() {
     assert!(write(&file_in(&folder), &bad).is_err());
 }
 
+/// A text file of one Gaussian with these lines after the first, the values last.
+fn with_lines(lines: &str) -> Vec<u8> {
+    let text = ascii(&scene(1, 0), "float");
+    text.replacen("format ascii 1.0\ncomment by hand\n", lines, 1)
+        .into_bytes()
+}
+
+fn read_bytes(bytes: &[u8]) -> Result<SplatData, SceneFileError> {
+    parse(Path::new("scene.ply"), bytes)
+}
+
 #[test]
-fn the_origin_survives_and_a_bad_one_is_refused() {
+fn origin_and_settings_survive() {
     let folder = TempDir::new().unwrap();
     let path = file_in(&folder);
     let mut scene = scene(3, 0);
     scene.origin = [4.5e6, -0.1, 1e-300];
+    scene.settings = SceneSettings {
+        scene_scale: Some(2.0 / 3.0),
+        antialias: Some(true),
+        background: Some([0.0, 0.1, 1.0]),
+        not_understood: Vec::new(),
+    };
     write(&path, &scene).unwrap();
     assert_eq!(read(&path).unwrap(), scene);
-
     let bytes = std::fs::read(&path).unwrap();
+    let header = String::from_utf8_lossy(&bytes);
+    // For other programs.
+    for line in [
+        "comment SplatRenderMode: mip\n",
+        "comment antialiased 1\n",
+        "comment burn-splat origin 4500000 -0.1 0.",
+        "comment burn-splat scene_scale 6.666666666666666e-1\n",
+        "comment burn-splat antialias 1\n",
+        "comment burn-splat background 0 0.1 1\n",
+    ] {
+        assert!(header.contains(line), "no `{line}`");
+    }
+
+    // An origin is a place: what begins like ours is no guess.
     let at = bytes.windows(7).position(|w| w == b"4500000").unwrap();
     let spoilt = [&bytes[..at], b"4500x00", &bytes[at + 7..]].concat();
     let message = error_of(&spoilt).to_string();
-    assert!(message.contains("`4500x00`"), "{message}");
+    assert!(
+        message.contains("4500x00") && message.contains("three finite"),
+        "{message}"
+    );
+
+    for (spoil, named) in [
+        (
+            (|s| s.scene_scale = Some(0.0)) as fn(&mut SceneSettings),
+            "scene_scale is 0.0",
+        ),
+        (
+            |s| s.background = Some([0.0, f32::NAN, 0.0]),
+            "background is [0.0, NaN, 0.0]",
+        ),
+    ] {
+        let mut bad = scene.clone();
+        spoil(&mut bad.settings);
+        let message = write(&path, &bad).unwrap_err().to_string();
+        assert!(message.contains(named), "{message}");
+    }
+    assert_eq!(read(&path).unwrap(), scene);
+}
+
+#[test]
+fn prose_in_comments_is_passed_over() {
+    let format = "format ascii 1.0\n";
+    for prose in [
+        "origin is scene centre",
+        "origin of this file: a scan",
+        "origin",
+        "origin 1 2 3 4",
+        "antialiased yes",
+        "antialiased",
+        "background 1 1 1",
+        "burn-splat",
+        "burn-splats antialias 1",
+        "",
+    ] {
+        let read = read_bytes(&with_lines(&format!("{format}comment {prose}\n")));
+        assert_eq!(read.unwrap(), scene(1, 0), "`{prose}`");
+    }
+    // The form of earlier versions is still an origin.
+    let old = read_bytes(&with_lines(&format!("{format}comment origin 1 -2e3 0.5\n"))).unwrap();
+    assert_eq!(old.origin, [1.0, -2000.0, 0.5]);
+}
+
+#[test]
+fn comments_that_almost_say_something_are_told_or_refused() {
+    let read = |comment: &str| read_bytes(&with_lines(&format!("format ascii 1.0\n{comment}\n")));
+    for told in [
+        "origin 1 2 3x",
+        "SplatRenderMode: 2dgs",
+        "burn-splat gamma 2.2",
+        "burn-splat is a program",
+    ] {
+        let settings = read(&format!("comment {told}")).unwrap().settings;
+        assert_eq!(settings.not_understood, [told]);
+    }
+    for refused in [
+        "burn-splat origin 1 2",
+        "burn-splat origin 1 2 inf",
+        "burn-splat scene_scale -1",
+        "burn-splat scene_scale NaN",
+        "burn-splat antialias 2",
+        "burn-splat antialias",
+        "burn-splat background 1 1",
+        "burn-splat background 1 1 nan",
+    ] {
+        let message = read(&format!("comment {refused}")).unwrap_err().to_string();
+        assert!(message.contains(refused), "{message}");
+    }
+    // Two comments: of ours they must agree, of others the first counts, ours before theirs.
+    let both = |a: &str, b: &str| read(&format!("comment {a}\ncomment {b}"));
+    let message = both("burn-splat antialias 1", "burn-splat antialias 0").unwrap_err();
+    assert!(message.to_string().contains("something else"), "{message}");
+    let settings = both("SplatRenderMode: mip", "antialiased 0")
+        .unwrap()
+        .settings;
+    assert_eq!(settings.antialias, Some(true));
+    assert_eq!(settings.not_understood, ["antialiased 0"]);
+    let settings = both("antialiased 0", "burn-splat antialias 1")
+        .unwrap()
+        .settings;
+    assert_eq!(
+        (settings.antialias, settings.not_understood.len()),
+        (Some(true), 0)
+    );
+    let scene = both("origin 1 2 3", "burn-splat origin 4 5 6").unwrap();
+    assert_eq!(scene.origin, [4.0, 5.0, 6.0]);
+}
+
+#[test]
+fn odd_headers_are_read() {
+    let plain = ascii(&scene(2, 0), "float");
+    let odd: [(&str, Vec<u8>); 8] = [
+        (
+            "byte-order mark",
+            [b"\xEF\xBB\xBF", plain.as_bytes()].concat(),
+        ),
+        ("CRLF", plain.replace('\n', "\r\n").into_bytes()),
+        (
+            "comments before the format",
+            plain
+                .replacen("format", "comment first\nobj_info second 2\nformat", 1)
+                .into_bytes(),
+        ),
+        (
+            "blank lines",
+            plain.replacen("format", "\n \t\nformat", 1).into_bytes(),
+        ),
+        (
+            "indentation",
+            plain.replace("property", "  property").into_bytes(),
+        ),
+        (
+            "spaces at the ends",
+            plain
+                .replace("float", "float ")
+                .replace("1.0\n", "1.0 \n")
+                .into_bytes(),
+        ),
+        (
+            "Latin-1",
+            [
+                b"ply\ncomment cr\xe9\xe9 par un autre\n",
+                &plain.as_bytes()[4..],
+            ]
+            .concat(),
+        ),
+        (
+            "empty comments",
+            plain
+                .replacen("comment by hand", "comment\nobj_info\ncomment a\rb", 1)
+                .into_bytes(),
+        ),
+    ];
+    for (name, bytes) in odd {
+        let read = read_bytes(&bytes);
+        assert_eq!(
+            read.unwrap_or_else(|error| panic!("{name}: {error}")),
+            scene(2, 0),
+            "{name}"
+        );
+    }
+    // Behind the last line of a header with carriage returns come the values, to the byte.
+    let folder = TempDir::new().unwrap();
+    write(&file_in(&folder), &scene(2, 1)).unwrap();
+    let bytes = std::fs::read(file_in(&folder)).unwrap();
+    let end = b"end_header\n";
+    let at = bytes.windows(end.len()).position(|w| w == end).unwrap() + end.len();
+    let header = String::from_utf8_lossy(&bytes[..at]).replace('\n', "\r\n");
+    let read = read_bytes(&[header.as_bytes(), &bytes[at..]].concat());
+    assert_eq!(read.unwrap(), scene(2, 1));
+
+    let old_mac = plain.replace('\n', "\r");
+    let message = error_of(old_mac.as_bytes()).to_string();
+    assert!(message.contains("carriage returns"), "{message}");
+    let message = error_of(plain.replacen("element", "elephant", 1).as_bytes()).to_string();
+    assert!(
+        message.contains("Line 4") && message.contains("elephant"),
+        "{message}"
+    );
+}
+
+/// Neither a header without an end nor an element of nothing takes time or memory.
+#[test]
+fn headers_that_announce_too_much_end_soon() {
+    let endless = [b"ply\ncomment ".to_vec(), vec![b'x'; 3 << 20]].concat();
+    let message = error_of(&endless).to_string();
+    assert!(
+        message.contains("end_header") && message.len() < 200,
+        "{message}"
+    );
+
+    let folder = TempDir::new().unwrap();
+    write(&file_in(&folder), &scene(1, 0)).unwrap();
+    let bytes = std::fs::read(file_in(&folder)).unwrap();
+    let text = b"element vertex 1\n";
+    let at = bytes.windows(text.len()).position(|w| w == text).unwrap();
+    let nothing = format!("element nothing {}\n", u64::MAX);
+    let padded = [&bytes[..at], nothing.as_bytes(), &bytes[at..]].concat();
+    assert_eq!(read_bytes(&padded).unwrap(), scene(1, 0));
 }
 
 /// Of two properties of one name the library keeps one, and reads every value behind it from the wrong place.

@@ -4,9 +4,10 @@ use std::path::PathBuf;
 
 use clap::Args;
 
-use super::{DeviceChoice, Failure, GlobalArgs, device, print, write};
+use super::{DeviceChoice, Failure, GlobalArgs, device, print, probe_report, write};
 use crate::accuracy::report::{Backend, Report};
 use crate::report::metrics::write_json;
+use crate::report::probe_files;
 
 /// The 38 hard cases: error of image and gradients, and time
 #[derive(Debug, Args)]
@@ -29,6 +30,8 @@ pub struct AccuracyArgs {
 /// Runs the command.
 pub(super) fn run(args: &AccuracyArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let backends = backends(global)?;
+    probe_files([&args.json])?;
+    probe_report(&args.report, &["accuracy.svg", "ACCURACY.md"])?;
     let report = Report::measure(&backends, |backend, case| {
         global.say(format_args!(
             "case {:>2} on {}: {}",

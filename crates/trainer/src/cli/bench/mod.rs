@@ -7,13 +7,13 @@ mod rasterize;
 mod scaling;
 mod step;
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use burn::tensor::Device;
 use clap::{Args, Subcommand};
 
 use super::{DeviceChoice, Failure, GlobalArgs, device, print};
-use crate::report::{ReportError, write_atomically};
+use crate::report::{ReportError, probe_file, write_atomically};
 
 /// Measure errors and speed
 #[derive(Debug, Args)]
@@ -50,6 +50,14 @@ pub(super) fn run(args: &BenchArgs, global: &GlobalArgs) -> Result<(), Failure> 
         Bench::Performance(args) => performance::run(args, global),
         Bench::Point(args) => scaling::run_point(args, global),
     }
+}
+
+/// Tries whether the files of a report can be written, before the long work.
+fn probe_report(folder: &Option<PathBuf>, names: &[&str]) -> Result<(), ReportError> {
+    let Some(folder) = folder else { return Ok(()) };
+    names
+        .iter()
+        .try_for_each(|name| probe_file(&folder.join(name)))
 }
 
 /// Writes a file of a report.

@@ -5,11 +5,19 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::input::{CaptureArgs, EXAMPLE};
-use super::{Failure, GlobalArgs, cpu_only, print, rasterize, scaling, write, write_svg};
+use super::{
+    Failure, GlobalArgs, cpu_only, print, probe_report, rasterize, scaling, write, write_svg,
+};
 use crate::performance::page::PerformanceReport;
 use crate::performance::scaling::{GAUSSIANS, PIXELS, PhotoSize};
 use crate::performance::step;
 use crate::report::metrics::write_json;
+use crate::report::probe_files;
+
+/// The files of the report.
+const PAGE: &str = "PERFORMANCE.md";
+const STEP_SVG: &str = "performance_step.svg";
+const SCALING_SVG: &str = "performance_scaling.svg";
 
 /// All of step, rasterize and scaling, and the page PERFORMANCE.md of them
 #[derive(Debug, Args)]
@@ -38,6 +46,8 @@ pub(super) fn run(args: &PerformanceArgs, global: &GlobalArgs) -> Result<(), Fai
     let folder = args.capture.as_deref();
     let capture = args.input.open(folder, global)?;
     let config = args.input.config(global);
+    probe_files([&args.json])?;
+    probe_report(&args.report, &[STEP_SVG, SCALING_SVG, PAGE])?;
     let say = |line: &str| global.say(line);
     let report = PerformanceReport {
         step: step::measure(&capture, &config, args.input.seconds, say)?,
@@ -51,13 +61,13 @@ pub(super) fn run(args: &PerformanceArgs, global: &GlobalArgs) -> Result<(), Fai
     }
     if let Some(folder) = &args.report {
         let pictures = [
-            ("performance_step.svg", report.step.svg()),
-            ("performance_scaling.svg", report.scaling.svg()),
+            (STEP_SVG, report.step.svg()),
+            (SCALING_SVG, report.scaling.svg()),
         ];
         for (name, svg) in pictures {
             write_svg(&folder.join(name), svg)?;
         }
-        write(folder, "PERFORMANCE.md", &text)?;
+        write(folder, PAGE, &text)?;
     }
     Ok(())
 }

@@ -11,6 +11,7 @@ use crate::capture::View;
 use crate::cli::scene;
 use crate::performance::rasterize::{RasterizeReport, measure};
 use crate::report::metrics::write_json;
+use crate::report::probe_files;
 use crate::train::Trainer;
 
 /// The rasteriser: evaluations per second, on the CPU per core, on the lists of a real scene
@@ -49,6 +50,7 @@ pub(super) fn run(args: &RasterizeArgs, global: &GlobalArgs) -> Result<(), Failu
         (Some(capture), None) | (None, Some(capture)) => (None, Some(capture)),
         (None, None) => (None, None),
     };
+    probe_files([&args.json])?;
     let report = report(
         ply.map(PathBuf::as_path),
         capture.map(PathBuf::as_path),

@@ -12,6 +12,7 @@ use crate::performance::scaling::{
     GAUSSIANS, PIXELS, PhotoSize, Point, ScalingReport, measure_point, synthetic_capture,
 };
 use crate::report::metrics::write_json;
+use crate::report::{probe_files, probe_folder};
 
 /// Step time and memory against Gaussians and pixels, on a synthetic scene
 #[derive(Debug, Args)]
@@ -64,6 +65,15 @@ pub(super) struct SyntheticArgs {
 /// Writes a synthetic capture.
 pub(super) fn run_synthetic(args: &SyntheticArgs) -> Result<(), Failure> {
     check_gaussians("GAUSSIANS", &[args.gaussians])?;
+    // The photos take long to render.
+    let model = args.out.join("sparse");
+    if model.exists() {
+        return Err(Failure::BadInput(format!(
+            "{}: there is a capture already; choose another folder",
+            model.display()
+        )));
+    }
+    probe_folder(&args.out)?;
     synthetic_capture(args.gaussians, args.pixels).save(&args.out)?;
     print(&format!("{}\n", args.out.display()));
     Ok(())
@@ -78,6 +88,8 @@ fn check_gaussians(name: &str, gaussians: &[usize]) -> Result<(), Failure> {
 
 /// Runs the command.
 pub(super) fn run(args: &ScalingArgs, global: &GlobalArgs) -> Result<(), Failure> {
+    check_gaussians("--gaussians", &args.gaussians)?;
+    probe_files([&args.json, &args.svg])?;
     let report = report(&args.gaussians, &args.pixels, global)?;
     print(&format!("{}\n{}", report.machine.line(), report.markdown()));
     if let Some(path) = &args.json {
@@ -102,7 +114,6 @@ pub(super) fn report(
     sizes: &[PhotoSize],
     global: &GlobalArgs,
 ) -> Result<ScalingReport, Failure> {
-    check_gaussians("--gaussians", gaussians)?;
     let device = chosen(global)?;
     let mut done = 0;
     let start = Instant::now();

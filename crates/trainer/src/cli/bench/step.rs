@@ -9,6 +9,7 @@ use super::input::CaptureArgs;
 use super::{Failure, GlobalArgs, chosen, print, write_svg};
 use crate::performance::{device_step, step};
 use crate::report::metrics::write_json;
+use crate::report::probe_files;
 
 /// The training step: time, stages, work; on the CPU with one thread and all, on a device with its launches, memory and
 /// share of the memory's bandwidth
@@ -44,6 +45,7 @@ pub(super) fn run(args: &StepArgs, global: &GlobalArgs) -> Result<(), Failure> {
     }
     let capture = args.input.open(args.capture.as_deref(), global)?;
     let config = args.input.config(global);
+    probe_files([&args.json, &args.svg])?;
     let (seconds, say) = (args.input.seconds, |line: &str| global.say(line));
     if on_device {
         let report = device_step::measure(&capture, &config, &device, seconds, say)?;

@@ -33,6 +33,20 @@ pub(super) fn describe(path: &Path, scene: &SplatData) -> String {
         let [x, y, z] = scene.origin;
         let _ = writeln!(text, "origin  {x} {y} {z}");
     }
+    let settings = &scene.settings;
+    if let Some(scale) = settings.scene_scale {
+        let _ = writeln!(text, "scene scale  {scale}");
+    }
+    if let Some(antialias) = settings.antialias {
+        let _ = writeln!(
+            text,
+            "anti-aliasing  {}",
+            if antialias { "on" } else { "off" }
+        );
+    }
+    if let Some([r, g, b]) = settings.background {
+        let _ = writeln!(text, "background  {r} {g} {b}");
+    }
     let _ = write!(text, "bounds\n{}", bounds_text(bounds(positions())));
     let _ = write!(
         text,
@@ -57,7 +71,7 @@ pub(super) fn describe(path: &Path, scene: &SplatData) -> String {
 fn warnings(scene: &SplatData, opacities: impl Iterator<Item = f64>) -> Vec<String> {
     let no_rotation = |quat: &&[f32; 4]| quat.iter().all(|&q| q == 0.0);
     let overflows = |scales: &&[f32; 3]| scales.iter().any(|s| !s.exp().is_finite());
-    [
+    let counted = [
         (
             opacities.filter(|&opacity| opacity < ALPHA_MIN).count(),
             "have an opacity below 1/255 and are never drawn",
@@ -70,11 +84,12 @@ fn warnings(scene: &SplatData, opacities: impl Iterator<Item = f64>) -> Vec<Stri
             scene.log_scales.iter().filter(overflows).count(),
             "have a scale that 32-bit floats cannot hold and are never drawn",
         ),
-    ]
-    .into_iter()
-    .filter(|(count, _)| *count > 0)
-    .map(|(count, what)| format!("{count} Gaussian(s) {what}"))
-    .collect()
+    ];
+    let counted = counted.into_iter().filter(|(count, _)| *count > 0);
+    let counted = counted.map(|(count, what)| format!("{count} Gaussian(s) {what}"));
+    let comments = scene.settings.not_understood.iter();
+    let comments = comments.map(|comment| format!("not followed: comment `{comment}`"));
+    counted.chain(comments).collect()
 }
 
 /// The range of each axis without its lowest and highest hundredth, which stray far in most scenes.
@@ -103,12 +118,13 @@ fn whole_range(values: impl Iterator<Item = f64>) -> (f64, f64) {
 
 #[cfg(test)]
 mod tests {
+    use splat_model::files::SceneSettings;
+
     use super::*;
 
     #[test]
     fn a_scene_is_described() {
         let scene = SplatData {
-            origin: [0.0; 3],
             means: vec![[0.0, -1.0, 2.0], [4.0, 1.0, 2.5]],
             log_scales: vec![[-4.0; 3], [0.0, 1.0, 99.0]],
             quats: vec![[0.0; 4], [1.0, 0.0, 0.0, 0.0]],
@@ -116,6 +132,13 @@ mod tests {
             sh0: vec![[0.0; 3]; 2],
             sh_rest: vec![0.0; 18],
             sh_degree: 1,
+            settings: SceneSettings {
+                scene_scale: Some(2.5),
+                antialias: Some(true),
+                background: Some([0.0, 0.5, 1.0]),
+                not_understood: vec!["SplatRenderMode: 2dgs".into()],
+            },
+            ..SplatData::default()
         };
         let text = describe(Path::new("a.ply"), &scene);
         // Flat ones are counted, and have no influence on the range.
@@ -127,6 +150,10 @@ mod tests {
         for line in [
             "Gaussians  2",
             "SH degree  1",
+            "scene scale  2.5",
+            "anti-aliasing  on",
+            "background  0 0.5 1",
+            "warning: not followed: comment `SplatRenderMode: 2dgs`",
             "  y  -1.0000 to 1.0000",
             "warning: 1 Gaussian(s) have an opacity below 1/255",
             "warning: 1 Gaussian(s) have the quaternion 0",

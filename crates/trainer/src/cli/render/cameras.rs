@@ -9,9 +9,8 @@ use splat_model::Camera;
 use splat_model::files::SplatData;
 use splat_model::ops::ImageSize;
 
-use super::super::Failure;
+use super::super::{Failure, text};
 use crate::capture::{Capture, View};
-use crate::text::without_mark;
 
 /// Most pixels on a side: one picture of this size is about 3 GB in the making.
 const MOST_PIXELS: u32 = 16_384;
@@ -41,29 +40,29 @@ struct FileCamera {
 
 /// The cameras of a file, by their names or their place in it.
 pub(super) fn of_file(path: &Path) -> Result<Vec<(String, Camera)>, Failure> {
-    let bad = |reason: String| Failure::BadInput(format!("{}: {reason}", path.display()));
-    let bytes = std::fs::read(path).map_err(|error| bad(error.to_string()))?;
-    let text = without_mark(&bytes).map_err(|reason| bad(reason.to_owned()))?;
+    text::read(path, of_text)
+}
+
+/// The cameras of a file's text.
+fn of_text(text: &str) -> Result<Vec<(String, Camera)>, String> {
     let read = || -> serde_json::Result<Vec<FileCamera>> {
-        match serde_json::from_slice(text)? {
+        match serde_json::from_str(text)? {
             list @ serde_json::Value::Array(_) => serde_json::from_value(list),
             one => Ok(vec![serde_json::from_value(one)?]),
         }
     };
     let cameras = read().map_err(|error| {
-        bad(format!(
-            "neither a camera nor a list of cameras (see `splat render --help`): {error}"
-        ))
+        format!("neither a camera nor a list of cameras (see `splat render --help`): {error}")
     })?;
     if cameras.is_empty() {
-        return Err(bad("no camera in it".to_owned()));
+        return Err("no camera in it".to_owned());
     }
-    let named = |(index, camera): (usize, FileCamera)| -> Result<(String, Camera), Failure> {
+    let named = |(index, camera): (usize, FileCamera)| -> Result<(String, Camera), String> {
         let name = camera.name.clone();
         let name = name.unwrap_or_else(|| format!("camera_{index:04}"));
         match camera.checked() {
             Ok(camera) => Ok((name, camera)),
-            Err(reason) => Err(bad(format!("camera {index} (`{name}`): {reason}"))),
+            Err(reason) => Err(format!("camera {index} (`{name}`): {reason}")),
         }
     };
     cameras.into_iter().enumerate().map(named).collect()
@@ -182,6 +181,8 @@ mod tests {
         assert_eq!(cameras[0].0, "camera_0000");
         assert_eq!(cameras[0].1.position(), DVec3::new(-1.0, -2.0, -3.0));
         assert_eq!(read(&format!("[{good}, {good}]")).unwrap().len(), 2);
+        // As some editors begin a text.
+        assert_eq!(read(&format!("\u{FEFF}{good}")).unwrap().len(), 1);
         for (from, to) in [
             ("64", "0"),
             ("48", "99999"),

@@ -53,8 +53,9 @@ pub(super) fn meta(meta: &Meta) -> Result<(), String> {
     if !(0.0..=LONGEST_SECONDS).contains(&meta.elapsed_seconds) {
         return Err(format!("`elapsed_seconds` is {}", meta.elapsed_seconds));
     }
-    if !meta.origin.iter().all(|x| x.is_finite()) {
-        return Err(format!("`origin` is {:?}", meta.origin));
+    let origin = meta.origin_bits.map(f64::from_bits);
+    if !origin.iter().all(|x| x.is_finite()) {
+        return Err(format!("`origin_bits` are those of {origin:?}"));
     }
     if meta.edits_seen.len() != EDIT_LOGS {
         return Err(format!(

@@ -1,0 +1,193 @@
+//! What the comments of a PLY header say about a scene: where its means count from, and how it must be rendered.
+//!
+//! ```text
+//! comment burn-splat origin X Y Z
+//! comment burn-splat scene_scale S
+//! comment burn-splat antialias 0|1
+//! comment burn-splat background R G B
+//! ```
+//!
+//! Comments are prose, so what is ours begins with a word that nothing else begins with, and anything else is passed
+//! over. Exceptions are tags that others use, `SplatRenderMode: default|mip|2dgs` and `antialiased 0|1`, which are written
+//! too, and `origin X Y Z` with three finite numbers, the form of earlier versions.
+//!
+//! What begins with our word and names a setting must be readable: to guess would be to render something else. A setting
+//! with a name that we do not know (of a later version, perhaps) is told by [`SceneSettings::not_understood`].
+
+use std::path::Path;
+use std::str::FromStr;
+
+use super::super::{SceneFileError, SceneSettings, SplatData};
+
+/// First word of our comments.
+const OURS: &str = "burn-splat";
+
+/// The comments of a scene, without the word `comment`.
+pub(super) fn write(path: &Path, scene: &SplatData) -> Result<Vec<String>, SceneFileError> {
+    let bad = |setting, value: &dyn std::fmt::Debug, must_be| SceneFileError::Setting {
+        path: path.to_path_buf(),
+        setting,
+        value: format!("{value:?}"),
+        must_be,
+    };
+    let mut comments = Vec::new();
+    let [x, y, z] = scene.origin;
+    if scene.origin.iter().any(|value| !value.is_finite()) {
+        return Err(bad("origin", &scene.origin, "finite"));
+    }
+    if scene.origin != [0.0; 3] {
+        comments.push(format!("{OURS} origin {x} {y} {z}"));
+    }
+    let settings = &scene.settings;
+    if let Some(scale) = settings.scene_scale {
+        if !is_scale(scale) {
+            return Err(bad("scene_scale", &scale, "positive and finite"));
+        }
+        comments.push(format!("{OURS} scene_scale {scale:e}"));
+    }
+    if let Some(antialias) = settings.antialias {
+        let bit = u8::from(antialias);
+        let mode = if antialias { "mip" } else { "default" };
+        comments.push(format!("{OURS} antialias {bit}"));
+        comments.push(format!("SplatRenderMode: {mode}"));
+        comments.push(format!("antialiased {bit}"));
+    }
+    if let Some([r, g, b]) = settings.background {
+        if ![r, g, b].into_iter().all(f32::is_finite) {
+            return Err(bad("background", &[r, g, b], "finite"));
+        }
+        comments.push(format!("{OURS} background {r} {g} {b}"));
+    }
+    Ok(comments)
+}
+
+/// The origin and the settings that comments tell.
+pub(super) fn read(
+    path: &Path,
+    comments: &[String],
+) -> Result<([f64; 3], SceneSettings), SceneFileError> {
+    let mut found = Found::default();
+    let mut foreign = Found::default();
+    let mut settings = SceneSettings::default();
+    for comment in comments {
+        let words: Vec<&str> = comment.split_whitespace().collect();
+        let known = match words.as_slice() {
+            [OURS, name, values @ ..] => found.ours(name, values),
+            [OURS] => Ok(true),
+            words => foreign.others(words),
+        };
+        match known {
+            Ok(true) => {}
+            Ok(false) => settings.not_understood.push(words.join(" ")),
+            Err(reason) => {
+                return Err(SceneFileError::Header {
+                    path: path.to_path_buf(),
+                    reason: format!("comment `{}`: {reason}", words.join(" ")),
+                });
+            }
+        }
+    }
+    settings.scene_scale = found.scene_scale;
+    settings.antialias = found.antialias.or(foreign.antialias);
+    settings.background = found.background;
+    let origin = found.origin.or(foreign.origin);
+    Ok((origin.unwrap_or_default(), settings))
+}
+
+/// What was read so far.
+#[derive(Default)]
+struct Found {
+    origin: Option<[f64; 3]>,
+    scene_scale: Option<f64>,
+    antialias: Option<bool>,
+    background: Option<[f32; 3]>,
+}
+
+impl Found {
+    /// Takes a comment of ours: whether it is understood, or why it cannot be.
+    fn ours(&mut self, name: &str, values: &[&str]) -> Result<bool, String> {
+        match name {
+            "origin" => {
+                let three = numbers::<f64, 3>(values).filter(|v| v.iter().all(|x| x.is_finite()));
+                set(&mut self.origin, three.ok_or("not three finite numbers")?)?;
+            }
+            "scene_scale" => {
+                let scale = numbers::<f64, 1>(values).map(|[scale]| scale);
+                let scale = scale.filter(|scale| is_scale(*scale));
+                set(
+                    &mut self.scene_scale,
+                    scale.ok_or("not one positive finite number")?,
+                )?;
+            }
+            "antialias" => set(&mut self.antialias, bit(values).ok_or("neither 0 nor 1")?)?,
+            "background" => {
+                let three = numbers::<f32, 3>(values).filter(|v| v.iter().all(|x| x.is_finite()));
+                set(
+                    &mut self.background,
+                    three.ok_or("not three finite numbers")?,
+                )?;
+            }
+            _ => return Ok(false),
+        }
+        Ok(true)
+    }
+
+    /// Takes a comment that other programs, or earlier versions, write; everything else is prose.
+    fn others(&mut self, words: &[&str]) -> Result<bool, String> {
+        match words {
+            // Where two programs say two things, the first is followed, and the second told.
+            ["SplatRenderMode:", mode] => {
+                return Ok(match *mode {
+                    "default" => set(&mut self.antialias, false).is_ok(),
+                    "mip" => set(&mut self.antialias, true).is_ok(),
+                    _ => false,
+                });
+            }
+            ["antialiased", value] => {
+                let value = bit(&[*value]);
+                return Ok(value.is_none_or(|value| set(&mut self.antialias, value).is_ok()));
+            }
+            ["origin", values @ ..] if values.len() == 3 => {
+                let read = values.iter().filter_map(|value| value.parse::<f64>().ok());
+                match read.filter(|value| value.is_finite()).count() {
+                    3 => set(&mut self.origin, numbers(values).unwrap_or_default())?,
+                    0 => {}
+                    // Neither prose nor an origin.
+                    _ => return Ok(false),
+                }
+            }
+            _ => {}
+        }
+        Ok(true)
+    }
+}
+
+/// Puts a value where none was, or the same.
+fn set<T: PartialEq>(place: &mut Option<T>, value: T) -> Result<(), String> {
+    match place {
+        Some(other) if *other != value => {
+            Err("another comment says something else; remove one of them".into())
+        }
+        _ => {
+            *place = Some(value);
+            Ok(())
+        }
+    }
+}
+
+fn numbers<T: FromStr, const N: usize>(words: &[&str]) -> Option<[T; N]> {
+    let values: Option<Vec<T>> = words.iter().map(|word| word.parse().ok()).collect();
+    values?.try_into().ok()
+}
+
+fn bit(words: &[&str]) -> Option<bool> {
+    match words {
+        ["0"] => Some(false),
+        ["1"] => Some(true),
+        _ => None,
+    }
+}
+
+fn is_scale(scale: f64) -> bool {
+    scale.is_finite() && scale > 0.0
+}

@@ -1,0 +1,118 @@
+//! Which run a checkpoint belongs to: its settings and its capture. Another run does not go on from it.
+
+use serde::{Deserialize, Serialize};
+
+use super::super::TrainConfig;
+use super::super::fingerprint::Fingerprint;
+use super::{Checkpoint, CheckpointError};
+
+/// Settings that a resumed run may change: how long it is, and how much it may grow.
+const CHANGEABLE: [&str; 2] = ["steps", "density.max_gaussians"];
+
+/// What a run is apart from its state: which settings, on which capture.
+#[derive(Debug, Clone, Serialize, Deserialize)]
+pub(in super::super) struct RunRecord {
+    pub(in super::super) capture: Fingerprint,
+    /// As TOML, which keeps every digit.
+    #[serde(with = "as_toml")]
+    pub(in super::super) config: TrainConfig,
+    /// What was changed when it was resumed, see [`Checkpoint::changes_with`].
+    pub(in super::super) changes: Vec<String>,
+}
+
+impl Checkpoint {
+    /// Settings of the run.
+    pub fn config(&self) -> &TrainConfig {
+        &self.meta.run.config
+    }
+
+    /// Checks that a run with these settings is the run of this checkpoint, and has something left to train. Only
+    /// `steps` and `density.max_gaussians` may be others: everything else, the seed and the first Gaussians included,
+    /// would make it a run that nobody could repeat, and partly have no effect any more.
+    ///
+    /// # Errors
+    /// [`CheckpointError::OtherSettings`] and [`CheckpointError::NothingLeft`].
+    pub fn check_settings(&self, config: &TrainConfig) -> Result<(), CheckpointError> {
+        let mut same = config.clone();
+        same.steps = self.config().steps;
+        same.density.max_gaussians = self.config().density.max_gaussians;
+        if let Some(difference) = self.config().difference_in_words(&same) {
+            return Err(CheckpointError::OtherSettings {
+                path: self.path.clone(),
+                difference,
+            });
+        }
+        let (done, steps, wanted) = (self.step(), self.config().steps, config.steps);
+        // A run whose steps are all done may still have its results to write.
+        if wanted < done || (wanted == done && wanted != steps) {
+            return Err(CheckpointError::NothingLeft {
+                path: self.path.clone(),
+                done,
+                steps,
+                wanted,
+            });
+        }
+        Ok(())
+    }
+
+    /// What going on with these settings changes about the run, and what was changed before, each in a line.
+    pub fn changes_with(&self, config: &TrainConfig) -> Vec<String> {
+        let mut changes = self.meta.run.changes.clone();
+        for (name, was, is) in self.config().differences(config) {
+            if CHANGEABLE.contains(&name.as_str()) {
+                let step = self.step();
+                changes.push(format!(
+                    "from step {step} on {name} = {is}, before it was {was}"
+                ));
+            }
+        }
+        changes
+    }
+
+    /// Checks that the run is this one: its capture, its settings, the names of its loss terms. Returns the photos
+    /// that have other pixels.
+    pub(in super::super) fn check_run(
+        &self,
+        run: &RunRecord,
+        terms: &[String],
+    ) -> Result<Vec<String>, CheckpointError> {
+        self.check_settings(&run.config)?;
+        let was = &self.meta.run.capture;
+        if let Some(difference) = was.difference(&run.capture) {
+            return Err(CheckpointError::OtherCapture {
+                path: self.path.clone(),
+                name: was.name().to_owned(),
+                difference,
+            });
+        }
+        if self.meta.history.terms != terms {
+            let [was, is] = [&self.meta.history.terms[..], terms].map(|terms| terms.join(", "));
+            return Err(CheckpointError::OtherSettings {
+                path: self.path.clone(),
+                difference: format!("a loss of the terms {was}, not {is}"),
+            });
+        }
+        Ok(was.changed_photos(&run.capture))
+    }
+}
+
+/// A [`TrainConfig`] as the text of a `config.toml`.
+mod as_toml {
+    use serde::{Deserialize, Deserializer, Serializer, de, ser};
+
+    use super::TrainConfig;
+
+    pub(super) fn serialize<S: Serializer>(
+        config: &TrainConfig,
+        serializer: S,
+    ) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&toml::to_string(config).map_err(ser::Error::custom)?)
+    }
+
+    pub(super) fn deserialize<'a, D: Deserializer<'a>>(
+        deserializer: D,
+    ) -> Result<TrainConfig, D::Error> {
+        let text = String::deserialize(deserializer)?;
+        TrainConfig::parse(text.as_bytes()).map_err(de::Error::custom)
+    }
+}

@@ -1,0 +1,244 @@
+//! What a run remembers of its capture, so that it is not gone on with on another.
+
+use rayon::prelude::*;
+use serde::{Deserialize, Serialize};
+
+use crate::capture::{Capture, View};
+
+/// What tells one capture from another: of each view name, size, camera, use and photo; the number of points.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Fingerprint {
+    /// Name of its folder, for words only: folders are moved.
+    name: String,
+    points: usize,
+    views: Vec<ViewPrint>,
+}
+
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+struct ViewPrint {
+    name: String,
+    size: [u32; 2],
+    /// Checksum of intrinsics and pose, to the bit.
+    camera: u32,
+    /// Checksum of the pixels.
+    photo: u32,
+    usage: Usage,
+}
+
+/// What a view is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Usage {
+    TrainedOn,
+    HeldOut,
+    NotUsed,
+}
+
+impl Fingerprint {
+    /// Of a capture as it was loaded, downscaling included.
+    pub(super) fn of(capture: &Capture) -> Self {
+        let mut views: Vec<_> = capture.views.par_iter().map(ViewPrint::of).collect();
+        for &index in &capture.split.train {
+            views[index].usage = Usage::TrainedOn;
+        }
+        for &index in &capture.split.test {
+            views[index].usage = Usage::HeldOut;
+        }
+        Self {
+            name: capture.name.clone(),
+            points: capture.points.len(),
+            views,
+        }
+    }
+
+    /// Name of the capture's folder.
+    pub(super) fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The first thing that makes `given` another capture than this one, in words. Photos whose pixels alone differ do
+    /// not: see [`changed_photos`](Self::changed_photos).
+    pub(super) fn difference(&self, given: &Self) -> Option<String> {
+        let named = |print: &Self, name: &str| print.views.iter().any(|view| view.name == name);
+        let missing = |from: &Self, of: &Self| {
+            let mut missing = of.views.iter().filter(|view| !named(from, &view.name));
+            let first = missing.next()?;
+            Some((first.name.clone(), missing.count()))
+        };
+        if let Some((first, others)) = missing(given, self) {
+            return Some(format!(
+                "it lacks the photo `{first}`{}",
+                and_others(others)
+            ));
+        }
+        if let Some((first, others)) = missing(self, given) {
+            let others = and_others(others);
+            return Some(format!(
+                "its photo `{first}`{others} was not part of the run"
+            ));
+        }
+        for (was, is) in self.views.iter().zip(&given.views) {
+            if was.name != is.name {
+                return Some(format!(
+                    "photo `{}` stands where `{}` was",
+                    is.name, was.name
+                ));
+            }
+            let differs = |differs: fn(&ViewPrint, &ViewPrint) -> bool| {
+                let pairs = self.views.iter().zip(&given.views);
+                and_others(pairs.filter(|(was, is)| differs(was, is)).count() - 1)
+            };
+            let name = &is.name;
+            if was.size != is.size {
+                let [[a, b], [c, d]] = [is.size, was.size];
+                let others = differs(|was, is| was.size != is.size);
+                return Some(format!(
+                    "photo `{name}`{others} is {a}x{b} pixels, it was {c}x{d}"
+                ));
+            }
+            if was.camera != is.camera {
+                let others = differs(|was, is| was.camera != is.camera);
+                return Some(format!("photo `{name}`{others} has another camera"));
+            }
+            if was.usage != is.usage {
+                let others = differs(|was, is| was.usage != is.usage);
+                let [is, was] = [is.usage, was.usage].map(Usage::in_words);
+                return Some(format!("photo `{name}`{others} is {is}, it was {was}"));
+            }
+        }
+        (self.points != given.points).then(|| {
+            let (is, was) = (given.points, self.points);
+            format!("it has {is} points, it had {was}")
+        })
+    }
+
+    /// Names of the photos of `given`, the same capture, whose pixels are others.
+    pub(super) fn changed_photos(&self, given: &Self) -> Vec<String> {
+        let pairs = self.views.iter().zip(&given.views);
+        let changed = pairs.filter(|(was, is)| was.photo != is.photo);
+        changed.map(|(_, is)| is.name.clone()).collect()
+    }
+}
+
+impl ViewPrint {
+    fn of(view: &View) -> Self {
+        let numbers = view.intrinsics.iter().chain(view.viewmat.as_flattened());
+        let camera: Vec<u8> = numbers.flat_map(|value| value.to_le_bytes()).collect();
+        Self {
+            name: view.name.clone(),
+            size: [view.width, view.height],
+            camera: crc32fast::hash(&camera),
+            photo: crc32fast::hash(&view.image),
+            usage: Usage::NotUsed,
+        }
+    }
+}
+
+impl Usage {
+    fn in_words(self) -> &'static str {
+        match self {
+            Self::TrainedOn => "trained on",
+            Self::HeldOut => "held out",
+            Self::NotUsed => "not used",
+        }
+    }
+}
+
+fn and_others(count: usize) -> String {
+    match count {
+        0 => String::new(),
+        count => format!(" (and {count} more)"),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::capture::{CaptureOptions, Split};
+
+    fn capture() -> Capture {
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
+        let options = CaptureOptions {
+            downscale: 16,
+            ..CaptureOptions::default()
+        };
+        Capture::load(folder.as_ref(), &options).unwrap()
+    }
+
+    /// What was changed, and the words that must tell it.
+    type Change = (fn(&mut Capture), &'static [&'static str]);
+
+    #[test]
+    fn what_differs_is_said() {
+        let capture = capture();
+        let print = Fingerprint::of(&capture);
+        let json = serde_json::to_string(&print).unwrap();
+        assert_eq!(serde_json::from_str::<Fingerprint>(&json).unwrap(), print);
+
+        let same: [fn(&mut Capture); 3] = [
+            |_| {},
+            |c| c.name = "moved".into(),
+            |c| Arc::make_mut(&mut c.views[3].image).fill(0),
+        ];
+        for change in same {
+            let mut given = capture.clone();
+            change(&mut given);
+            assert_eq!(print.difference(&Fingerprint::of(&given)), None);
+        }
+        // `{N}` is the name of view N.
+        let changes: [Change; 7] = [
+            (|c| drop(c.views.remove(6)), &["lacks", "{6}"]),
+            (
+                |c| (c.views[1].name, c.views[2].name) = ("x".into(), "y".into()),
+                &["lacks", "{1}", "1 more"],
+            ),
+            (
+                |c| {
+                    let mut more = c.views[0].clone();
+                    more.name = "new.png".into();
+                    c.views.push(more);
+                },
+                &["`new.png`", "not part"],
+            ),
+            (
+                |c| (c.views[4].width, c.views[4].height) = (2, 6),
+                &["{4}", "2x6"],
+            ),
+            (
+                |c| c.views[5].viewmat[0][3] += 1e-9,
+                &["{5}", "another camera"],
+            ),
+            (
+                |c| c.split.test = vec![],
+                &["{0}", "3 more", "not used", "held out"],
+            ),
+            (|c| c.points.truncate(9), &["9 points, it had"]),
+        ];
+        for (change, words) in changes {
+            let mut given = capture.clone();
+            change(&mut given);
+            if given.views.len() < capture.views.len() {
+                given.split = Split::every_eighth(given.views.len());
+            }
+            let said = print.difference(&Fingerprint::of(&given)).unwrap();
+            for word in words {
+                let index = word.strip_prefix('{').and_then(|w| w.strip_suffix('}'));
+                let index = index.and_then(|index| index.parse::<usize>().ok());
+                let word = index.map_or((*word).to_owned(), |i| capture.views[i].name.clone());
+                assert!(said.contains(&word), "no `{word}` in: {said}");
+            }
+        }
+    }
+
+    #[test]
+    fn photos_of_other_pixels_are_named() {
+        let mut given = capture();
+        let print = Fingerprint::of(&given);
+        Arc::make_mut(&mut given.views[3].image).fill(0);
+        let name = given.views[3].name.clone();
+        assert_eq!(print.changed_photos(&Fingerprint::of(&given)), [name]);
+        assert!(print.changed_photos(&print).is_empty());
+    }
+}
