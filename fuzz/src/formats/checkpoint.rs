@@ -10,6 +10,7 @@ use burn_pack::{Bytes, DType, Reader, Scalar, Tensor, Writer};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use serde_json::{Value, json};
+use splat_trainer::fuzzing::expected_checksum;
 use splat_trainer::train::Checkpoint;
 use splat_trainer::{TrainConfig, Trainer};
 
@@ -30,6 +31,8 @@ pub(super) const TARGET: Target = Target {
 
 /// Key of the metadata.
 const META: &str = "burn_splat";
+/// Key of the checksum.
+const CHECKSUM: &str = "burn_splat_checksum";
 
 /// Few Gaussians, and density control at every step.
 fn config(steps: usize) -> TrainConfig {
@@ -78,6 +81,19 @@ fn mutate(input: &mut Input, rng: &mut Pcg64Mcg) {
     match changed {
         Some(changed) => *bytes = changed,
         None => file::mutate(bytes, rng),
+    }
+    // Most with the checksum of what they are now, or nothing would be looked at but that.
+    if rng.random_bool(0.95) {
+        seal(bytes);
+    }
+}
+
+fn seal(bytes: &mut Vec<u8>) {
+    if let Some(checksum) = expected_checksum(bytes)
+        && let Some((mut header, data)) = file::parts(bytes)
+    {
+        header["__metadata__"][CHECKSUM] = json!(checksum);
+        *bytes = file::joined(&header, &data);
     }
 }
 

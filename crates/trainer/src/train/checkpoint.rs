@@ -259,8 +259,7 @@ impl Checkpoint {
             )));
         }
         let file = SafeTensors::deserialize(bytes).map_err(bad)?;
-        let contents = file.iter().map(|(name, view)| (name, view.data()));
-        if entry(CHECKSUM) != Some(&checksum(meta, contents.collect())) {
+        if entry(CHECKSUM) != Some(&checksum_of(meta, &file)) {
             return Err(format(
                 "damaged: its checksum is another; go on from a copy, or begin the run again"
                     .into(),
@@ -377,6 +376,18 @@ impl Checkpoint {
             })?;
         Ok(Param::initialized(ParamId::from(id), value.require_grad()))
     }
+}
+
+/// The checksum that a file must have to be what was saved; none of what is no checkpoint.
+pub fn expected_checksum(bytes: &[u8]) -> Option<String> {
+    let (_, header) = SafeTensors::read_metadata(bytes).ok()?;
+    let meta = header.metadata().as_ref()?.get(META)?;
+    Some(checksum_of(meta, &SafeTensors::deserialize(bytes).ok()?))
+}
+
+fn checksum_of(meta: &str, file: &SafeTensors) -> String {
+    let contents = file.iter().map(|(name, view)| (name, view.data()));
+    checksum(meta, contents.collect())
 }
 
 /// Checksum of a file's contents: the metadata, then each tensor's name and bytes in the order of the names.

@@ -33,6 +33,8 @@ use crate::evaluate::evaluate;
 use checkpoint::RunRecord;
 use fingerprint::Fingerprint;
 
+#[doc(hidden)]
+pub use checkpoint::expected_checksum;
 pub use checkpoint::{Checkpoint, CheckpointError};
 pub use config::TrainConfig;
 
