@@ -94,8 +94,11 @@ impl TrainConfig {
     /// The settings that `other` has otherwise: name, value here, value there, as TOML has them.
     pub(super) fn differences(&self, other: &Self) -> Vec<(String, String, String)> {
         let mut found = Vec::new();
-        if let (Ok(here), Ok(there)) = (toml::Table::try_from(self), toml::Table::try_from(other)) {
-            compare("", &here, &there, &mut found);
+        match (toml::Table::try_from(self), toml::Table::try_from(other)) {
+            (Ok(here), Ok(there)) => compare("", &here, &there, &mut found),
+            // Such as a seed that is too large for TOML.
+            _ if self != other => found.push(("settings".into(), "others".into(), "these".into())),
+            _ => {}
         }
         found
     }
@@ -313,6 +316,8 @@ mod tests {
             "{words}"
         );
         assert!(words.ends_with("; seed = 0, not 3"), "{words}");
+        there.seed = u64::MAX;
+        assert!(here.difference_in_words(&there).is_some());
     }
 
     #[test]

@@ -423,6 +423,49 @@ fn a_full_disk_takes_no_more_than_it_must() {
     assert!(read("none", "scene.ply").is_err());
 }
 
+/// When all steps are done and a result cannot be saved, the checkpoint is left, and with it the rest is done later.
+#[test]
+fn a_run_whose_results_could_not_be_saved_is_finished_later() {
+    let folder = TempDir::new().unwrap();
+    let capture = example(folder.path());
+    let out = folder.path().join("out");
+    let more = [&SMALL[..], &["--steps", "60", "--autosave", "0"]].concat();
+    let child = training(&capture, "out", &more)
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    wait_for("checkpoint", || out.join("checkpoint.safetensors").exists());
+    // After the folder was tried.
+    fs::write(out.join("views"), "in the way").unwrap();
+    let output = child.wait_with_output().unwrap();
+    let said = stderr(&output);
+    assert_eq!(output.status.code(), Some(2), "{said}");
+    let last = said.trim_end().lines().last().unwrap();
+    for words in [
+        "views",
+        "not saved: views; saved: scene.ply",
+        "--resume out",
+    ] {
+        assert!(last.contains(words), "no `{words}` in {last}");
+    }
+    let scene = fs::read(out.join("scene.ply")).unwrap();
+    // The scores are not lost either.
+    assert!(String::from_utf8_lossy(&output.stdout).contains("mean"));
+
+    fs::remove_file(out.join("views")).unwrap();
+    let resumed = Command::new(env!("CARGO_BIN_EXE_splat"))
+        .current_dir(folder.path())
+        .args(["--device", "cpu", "train", "capture", "--resume", "out"])
+        .output()
+        .unwrap();
+    succeed(&resumed);
+    assert!(fs::read(out.join("scene.ply")).unwrap() == scene);
+    assert_eq!(metrics(&out)["steps"], 60);
+    assert_eq!(fs::read_dir(out.join("views")).unwrap().count(), 4);
+    assert!(!out.join("checkpoint.safetensors").exists());
+}
+
 /// How a scene must be rendered is in its file, whatever lies beside it.
 #[test]
 fn a_scenes_settings_stay_with_the_scene() {
