@@ -17,6 +17,7 @@
 //! number type (such as `double`), and ignores properties and elements it does not know.
 
 mod header;
+mod repetition;
 
 use std::cell::Cell;
 use std::fs::File;

@@ -1,12 +1,12 @@
 //! The header of a PLY file, read line by line up to its end.
 
-use std::collections::HashSet;
 use std::io::{BufRead, Read};
 use std::path::Path;
 
 use ply_rs_bw::parser::{Parser, Reader};
 use ply_rs_bw::ply::Header;
 
+use super::repetition::repetition;
 use super::{Row, SceneFileError, one_line};
 
 /// Most bytes of a header: hundreds of times what a scene of degree 3 needs. What has more is another kind of file.
@@ -41,25 +41,4 @@ pub(super) fn read(path: &Path, reader: &mut impl BufRead) -> Result<Header, Sce
     Parser::<Row>::new()
         .read_header(&mut Reader::new(text.as_bytes()))
         .map_err(|failure| error(format!("no PLY header: {}", one_line(&failure.to_string()))))
-}
-
-/// The first line that repeats the name of an element, or that of a property of its element. The library would keep one
-/// of the two, and read every value behind it from the wrong place.
-fn repetition(header: &str) -> Option<&str> {
-    let (mut elements, mut properties) = (HashSet::new(), HashSet::new());
-    for line in header.lines() {
-        let mut words = line.split_whitespace();
-        let (known, name) = match words.next() {
-            Some("element") => {
-                properties.clear();
-                (&mut elements, words.next())
-            }
-            Some("property") => (&mut properties, words.last()),
-            _ => continue,
-        };
-        if name.is_some_and(|name| !known.insert(name)) {
-            return Some(line.trim());
-        }
-    }
-    None
 }
