@@ -33,6 +33,8 @@ pub struct Report {
     pub accepted: u64,
     /// Those of them that were handed on.
     pub followed: u64,
+    /// Those of them that whoever they were handed to took.
+    pub taken: u64,
     /// Different outcomes: messages without their numbers and quotations.
     pub outcomes: usize,
     /// Inputs kept.
@@ -92,10 +94,13 @@ impl Campaign {
             report: Report::default(),
         };
         for input in (target.seeds)() {
-            let accepted = campaign.report.accepted;
+            let (accepted, taken) = (campaign.report.accepted, campaign.report.taken);
             campaign.execute(&input, true)?;
             if campaign.report.accepted == accepted {
                 return Err(campaign.failed("a seed is refused".into(), &input));
+            }
+            if campaign.report.taken == taken {
+                return Err(campaign.failed("a seed is let through, but of no use".into(), &input));
             }
             campaign.valid.push(campaign.corpus.len());
             campaign.corpus.push(input);
@@ -194,8 +199,12 @@ impl Campaign {
             self.report.accepted += 1;
             if always || hash_of(&input.0).is_multiple_of(self.target.follow_every) {
                 self.report.followed += 1;
-                if catch_unwind(AssertUnwindSafe(follow)).is_err() {
-                    return Err(self.failed("what the reader lets through panics".into(), input));
+                match catch_unwind(AssertUnwindSafe(follow)) {
+                    Ok(taken) => self.report.taken += u64::from(taken),
+                    Err(_) => {
+                        let reason = "what the reader lets through panics".into();
+                        return Err(self.failed(reason, input));
+                    }
                 }
             }
         }

@@ -210,6 +210,6 @@ fn parse(input: &Input) -> Result<Follow, String> {
     let checkpoint = checkpoint.map_err(|error| error.to_string())?;
     Ok(Box::new(move || {
         let config = config(checkpoint.step().saturating_add(4));
-        train_steps(capture(), config, Some(checkpoint));
+        train_steps(capture(), config, Some(checkpoint))
     }))
 }

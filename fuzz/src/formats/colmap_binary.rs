@@ -35,7 +35,7 @@ pub(super) fn parse(binary: bool, input: &Input) -> Result<Follow, String> {
             steps: 4,
             ..TrainConfig::default()
         };
-        train_steps(Arc::new(capture), config, None);
+        train_steps(Arc::new(capture), config, None)
     }))
 }
 

@@ -20,8 +20,8 @@ use splat_trainer::{Capture, TrainConfig, Trainer};
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Input(pub Vec<Vec<u8>>);
 
-/// What the program would do with what a reader let through.
-pub type Follow = Box<dyn FnOnce()>;
+/// What the program would do with what a reader let through; whether it does.
+pub type Follow = Box<dyn FnOnce() -> bool>;
 
 /// A reader to fuzz.
 pub struct Target {
@@ -88,8 +88,8 @@ fn capture() -> Arc<Capture> {
     CAPTURE.clone()
 }
 
-/// Takes some steps of a run, as far as it can be begun: refusing is fine.
-fn train_steps(capture: Arc<Capture>, config: TrainConfig, checkpoint: Option<Checkpoint>) {
+/// Takes some steps of a run, and says whether it could: refusing is fine.
+fn train_steps(capture: Arc<Capture>, config: TrainConfig, checkpoint: Option<Checkpoint>) -> bool {
     let mut trainer = Trainer::builder()
         .capture(capture)
         .config(config)
@@ -97,13 +97,12 @@ fn train_steps(capture: Arc<Capture>, config: TrainConfig, checkpoint: Option<Ch
     if let Some(checkpoint) = checkpoint {
         trainer = trainer.resume(checkpoint);
     }
-    let mut left = 3;
-    if let Ok(mut trainer) = trainer.build() {
-        // The third may already add and remove Gaussians.
-        while trainer.step().is_ok() && trainer.gaussians().len() < 1_000 && left > 1 {
-            left -= 1;
-        }
-    }
+    let Ok(mut trainer) = trainer.build() else {
+        return false;
+    };
+    // The third may already add and remove Gaussians.
+    let few = |trainer: &Trainer| trainer.gaussians().len() < 1_000;
+    (0..3).all(|_| !few(&trainer) || trainer.step().is_ok())
 }
 
 /// Replaces a value somewhere in a JSON text by an odd one, or drops, repeats or renames an entry.

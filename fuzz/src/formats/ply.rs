@@ -144,7 +144,7 @@ fn parse(input: &Input) -> Result<Follow, String> {
     let scene = scene.map_err(|error| error.to_string())?;
     Ok(Box::new(move || {
         if scene.len() > 100 {
-            return;
+            return false;
         }
         let device = Device::flex();
         let gaussians = Gaussians::from_data(&scene, &device);
@@ -154,8 +154,7 @@ fn parse(input: &Input) -> Result<Follow, String> {
             sh_degree: scene.sh_degree,
             ..RenderSettings::default()
         };
-        if let Ok(rendered) = render(&gaussians, &cameras, &settings) {
-            let _ = rendered.image().into_data();
-        }
+        let rendered = render(&gaussians, &cameras, &settings);
+        rendered.is_ok_and(|rendered| rendered.image().try_into_vec_as::<f32>().is_ok())
     }))
 }

@@ -19,6 +19,7 @@
 
 mod comments;
 mod header;
+mod repetition;
 
 use std::cell::Cell;
 use std::fs::File;

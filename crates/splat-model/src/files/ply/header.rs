@@ -3,7 +3,6 @@
 //! Headers come from many programs and text editors. A byte-order mark before `ply`, blank lines, indentation, carriage
 //! returns before line feeds, comments before `format`, and comments in another encoding than UTF-8 change nothing.
 
-use std::collections::HashSet;
 use std::io::{BufRead, Read};
 use std::path::Path;
 
@@ -11,6 +10,7 @@ use ply_rs_bw::parser::{Parser, Reader};
 use ply_rs_bw::ply::Header;
 
 use super::super::SceneFileError;
+use super::repetition::repetition;
 use super::{Row, one_line};
 
 /// A header is no longer than this many bytes: what is longer is something else.
@@ -77,25 +77,4 @@ pub(super) fn read(
         let (message, _) = message.split_once("\n\tError:").unwrap_or((&message, ""));
         bad(one_line(message))
     })
-}
-
-/// The first line that repeats the name of an element, or that of a property of its element. The library would keep one
-/// of the two, and read every value behind it from the wrong place.
-fn repetition(header: &str) -> Option<&str> {
-    let (mut elements, mut properties) = (HashSet::new(), HashSet::new());
-    for line in header.lines() {
-        let mut words = line.split_whitespace();
-        let (known, name) = match words.next() {
-            Some("element") => {
-                properties.clear();
-                (&mut elements, words.next())
-            }
-            Some("property") => (&mut properties, words.last()),
-            _ => continue,
-        };
-        if name.is_some_and(|name| !known.insert(name)) {
-            return Some(line.trim());
-        }
-    }
-    None
 }

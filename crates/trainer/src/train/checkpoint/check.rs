@@ -8,6 +8,8 @@ use super::{History, Meta, SavedTensor};
 
 /// More is no run but a damaged file: 300 years.
 const LONGEST_SECONDS: f64 = 1e10;
+/// More steps are none either: at a thousand a second they take thirty years.
+const MOST_STEPS: u64 = 1_000_000_000_000;
 /// Logs of edits, one per field.
 const EDIT_LOGS: usize = 6;
 
@@ -52,6 +54,9 @@ pub(super) fn tensors(tensors: &[SavedTensor]) -> Result<(), String> {
 pub(super) fn meta(meta: &Meta) -> Result<(), String> {
     if !(0.0..=LONGEST_SECONDS).contains(&meta.elapsed_seconds) {
         return Err(format!("`elapsed_seconds` is {}", meta.elapsed_seconds));
+    }
+    if meta.step as u64 > MOST_STEPS {
+        return Err(format!("`step` is {}", meta.step));
     }
     let origin = meta.origin_bits.map(f64::from_bits);
     if !origin.iter().all(|x| x.is_finite()) {

@@ -93,6 +93,7 @@ fn a_run_that_cannot_have_been_is_refused() {
     assert!(damaged(&|meta| meta.history.losses[1].terms.clear()).contains("0 terms"));
     assert!(damaged(&|meta| meta.history.counts[0].0 = 99).contains("step 99"));
     assert!(damaged(&|meta| meta.elapsed_seconds = 1.8e19).contains("`elapsed_seconds`"));
+    assert!(damaged(&|meta| meta.step = usize::MAX).contains("`step`"));
     assert!(damaged(&|meta| meta.elapsed_seconds = -1.0).contains("`elapsed_seconds`"));
     assert!(damaged(&|meta| meta.edits_seen = vec![0; 5]).contains("`edits_seen` has 5"));
     assert!(damaged(&|meta| meta.edits_seen[0] = usize::MAX).contains("`edits_seen`"));
