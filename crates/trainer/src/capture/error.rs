@@ -180,6 +180,23 @@ pub enum CaptureError {
         /// What the decoder said.
         reason: String,
     },
+    /// The photos together need more memory than there is.
+    #[error(
+        "{}: {photos} photos need {:.1} GB of memory, and {:.1} GB are left; read them smaller (--downscale, now {downscale})",
+        root.display(), *needed as f64 / 1e9, *left as f64 / 1e9
+    )]
+    OutOfMemory {
+        /// The capture's folder.
+        root: PathBuf,
+        /// How many they are.
+        photos: usize,
+        /// Bytes of their pixels.
+        needed: u64,
+        /// Bytes that this process can still get.
+        left: u64,
+        /// The factor by which they were to be averaged.
+        downscale: u32,
+    },
     /// A photo whose shape is not that of its camera.
     #[error(
         "{}: the photo is {}x{} pixels, but its camera {camera_id} is {}x{}; {}",

@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use image::{DynamicImage, ImageError, ImageFormat, ImageReader};
 use rayon::prelude::*;
+use splat_model::ops::device::available_memory;
 
 use super::colmap::{Camera, Image, SparseModel};
 use super::{CaptureError, CaptureOptions, CaptureWarning, View, downscale, jpeg};
@@ -35,6 +36,7 @@ pub(super) fn load(
         }
     }
     let factor = options.downscale;
+    check_memory(root, &folder, model, factor, available_memory())?;
     let loaded: Vec<Result<Loaded, CaptureError>> = model
         .images
         .par_iter()
@@ -46,6 +48,52 @@ pub(super) fn load(
     warnings.extend(damaged(&loaded));
     warnings.extend(folders::unregistered(root, &folder, model));
     Ok(loaded.into_iter().map(|loaded| loaded.view).collect())
+}
+
+/// Refuses photos that memory could not hold: the allocation that failed would end the process.
+pub(super) fn check_memory(
+    root: &Path,
+    folder: &Path,
+    model: &SparseModel,
+    factor: u32,
+    left: Option<u64>,
+) -> Result<(), CaptureError> {
+    let bytes = |sides: [u32; 2]| {
+        let [width, height] = sides.map(|side| u64::from(side.div_ceil(factor)));
+        width.saturating_mul(height).saturating_mul(3)
+    };
+    let of_camera = |image: &Image| {
+        let camera = &model.cameras[&image.camera_id];
+        bytes([camera.width, camera.height])
+    };
+    let Some(left) = left else { return Ok(()) };
+    // Photos may be smaller than their cameras say; but to look at each takes time.
+    if model
+        .images
+        .iter()
+        .map(of_camera)
+        .fold(0, u64::saturating_add)
+        <= left
+    {
+        return Ok(());
+    }
+    let of_photo = |image: &Image| match image::image_dimensions(folder.join(&image.name)) {
+        Ok((width, height)) => bytes([width, height]),
+        // Told when it is decoded.
+        Err(_) => 0,
+    };
+    let photos = model.images.par_iter().map(of_photo);
+    let needed = photos.reduce(|| 0, u64::saturating_add);
+    if needed <= left {
+        return Ok(());
+    }
+    Err(CaptureError::OutOfMemory {
+        root: root.to_path_buf(),
+        photos: model.images.len(),
+        needed,
+        left,
+        downscale: factor,
+    })
 }
 
 /// A view and what was odd about its photo.
