@@ -17,6 +17,8 @@ use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
 
+use crate::report::progress::tell;
+
 pub use device::DeviceChoice;
 pub use failure::Failure;
 pub use gradcheck::{GradcheckArgs, Precision};
@@ -74,7 +76,7 @@ pub fn main() -> ExitCode {
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("{failure}");
+            tell(&failure.to_string());
             failure.exit_code()
         }
     }
@@ -84,7 +86,7 @@ impl GlobalArgs {
     /// Tells the user something that is no result.
     fn say(&self, line: impl std::fmt::Display) {
         if !self.quiet {
-            eprintln!("{line}");
+            tell(&line.to_string());
         }
     }
 }
