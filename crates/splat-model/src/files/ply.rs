@@ -17,6 +17,7 @@
 //! number type (such as `double`), and ignores properties and elements it does not know.
 
 mod header;
+mod names;
 mod repetition;
 
 use std::cell::Cell;
@@ -31,6 +32,7 @@ use ply_rs_bw::ply::{
 };
 use ply_rs_bw::writer::Writer;
 
+use self::names::property_names;
 use super::{SceneFileError, SplatData};
 
 /// First word of the comment that holds the origin.
@@ -195,20 +197,6 @@ fn origin(path: &Path, header: &Header) -> Result<[f64; 3], SceneFileError> {
         };
     }
     Ok(origin)
-}
-
-/// Names of the properties in the order they are written, for a scene of `rest` values `f_rest_*`.
-fn property_names(rest: usize) -> Vec<String> {
-    let numbered = |stem: &'static str, count| (0..count).map(move |i| format!("{stem}_{i}"));
-    ["x", "y", "z", "nx", "ny", "nz"]
-        .into_iter()
-        .map(str::to_owned)
-        .chain(numbered("f_dc", 3))
-        .chain(numbered("f_rest", rest))
-        .chain(["opacity".to_owned()])
-        .chain(numbered("scale", 3))
-        .chain(numbered("rot", 4))
-        .collect()
 }
 
 /// The values of one element in the order of the header.
