@@ -14,7 +14,7 @@
 //! let scene = files::ply::read("out/scene.ply".as_ref())?;
 //! let gaussians = Gaussians::from_data(&scene, &device);
 //! let view = camera(&capture.views[0]).tensors(&device);
-//! let settings = scene.settings.render_settings(scene.sh_degree);
+//! let settings = scene.render_settings();
 //! let image = render(&gaussians, &view, &settings)?.image(); // [1, H, W, 3]
 //! # Ok(()) }
 //! ```

@@ -2,7 +2,7 @@
 
 use std::collections::HashSet;
 use std::hash::{DefaultHasher, Hash, Hasher};
-use std::os::unix::fs::FileExt;
+use std::io::{Seek, Write};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -283,11 +283,12 @@ impl Watch {
     fn begin(&self, input: &Input) {
         let since = self.start.elapsed().as_millis() as u64;
         self.began.store(since.max(1), Ordering::Relaxed);
-        if let Some(file) = &self.file {
+        if let Some(mut file) = self.file.as_ref() {
             let bytes = input.0.concat();
             // Without the file a failure that aborts is repeated by its seed all the same.
             let _ = file
-                .write_all_at(&bytes, 0)
+                .rewind()
+                .and_then(|()| file.write_all(&bytes))
                 .and_then(|()| file.set_len(bytes.len() as u64));
         }
     }

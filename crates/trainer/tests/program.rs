@@ -345,3 +345,26 @@ fn benches_refuse_what_they_cannot_measure_in_one_line() {
         assert_eq!(errors.trim_end().lines().count(), 1, "{errors}");
     }
 }
+
+/// As behind `splat ... 2>&1 | head -1`.
+#[test]
+fn that_nobody_reads_what_is_said_ends_nothing() {
+    let fixture = concat!(
+        env!("CARGO_MANIFEST_DIR"),
+        "/../../tests/fixtures/one_gaussian.safetensors"
+    );
+    for (arguments, status) in [
+        (["gradcheck", fixture], 0),
+        (["gradcheck", "no such file"], 2),
+    ] {
+        let mut child = Command::new(env!("CARGO_BIN_EXE_splat"))
+            .args(["--device", "cpu"])
+            .args(arguments)
+            .stdout(std::process::Stdio::null())
+            .stderr(std::process::Stdio::piped())
+            .spawn()
+            .unwrap();
+        drop(child.stderr.take());
+        assert_eq!(child.wait().unwrap().code(), Some(status), "{arguments:?}");
+    }
+}

@@ -73,6 +73,7 @@ fn seeds() -> Vec<Input> {
 /// Reads settings; what is let through begins a run.
 fn parse(input: &Input) -> Result<Follow, String> {
     let config = TrainConfig::parse(&input.0[0]);
-    let config = config.map_err(|error| error.to_string())?;
+    // As the program says it, with the file before it.
+    let config = config.map_err(|reason| format!("config.toml: {reason}"))?;
     Ok(Box::new(move || train_steps(capture(), config, None)))
 }

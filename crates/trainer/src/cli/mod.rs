@@ -20,6 +20,8 @@ use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
 
+use crate::report::progress::tell;
+
 pub use device::DeviceChoice;
 pub use failure::Failure;
 pub use gradcheck::{GradcheckArgs, Precision};
@@ -76,7 +78,7 @@ pub fn main() -> ExitCode {
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(failure) => {
-            eprintln!("{failure}");
+            tell(&failure.to_string());
             failure.exit_code()
         }
     }
@@ -86,7 +88,7 @@ impl GlobalArgs {
     /// Tells the user something that is no result.
     fn say(&self, line: impl std::fmt::Display) {
         if !self.quiet {
-            eprintln!("{line}");
+            tell(&line.to_string());
         }
     }
 }

@@ -2,6 +2,7 @@
 //! reference implementation made of them.
 
 mod metadata;
+mod unique;
 
 use std::path::Path;
 
@@ -9,6 +10,7 @@ use safetensors::{Dtype, SafeTensors};
 use splat_ops::{ImageSize, sh_coefficient_count};
 
 use self::metadata::Metadata;
+use self::unique::Unique;
 use super::GradcheckError;
 use super::scene::{Array, Inputs, Outputs, Scene, index_of};
 
@@ -69,7 +71,13 @@ impl Fixture {
             file: path.to_path_buf(),
             reason: reason.to_string(),
         };
-        let (_, header) = SafeTensors::read_metadata(bytes).map_err(format)?;
+        let (length, header) = SafeTensors::read_metadata(bytes).map_err(format)?;
+        // The header lies behind its length, and was just read as far as that.
+        let text = bytes.get(8..8 + length).unwrap_or_default();
+        serde_json::from_slice::<Unique>(text).map_err(|error| GradcheckError::Format {
+            file: path.to_path_buf(),
+            reason: format!("its header: {error}"),
+        })?;
         let reader = Reader {
             file: path,
             tensors: SafeTensors::deserialize(bytes).map_err(format)?,

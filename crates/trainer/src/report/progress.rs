@@ -2,7 +2,7 @@
 //!
 //! All of it goes to standard error, so that standard output holds results alone.
 
-use std::io::IsTerminal;
+use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
@@ -65,7 +65,7 @@ impl Progress {
                 *last = Instant::now();
                 let here = done.saturating_sub(self.start);
                 let line = plain_line(done, self.total, here, self.started.elapsed(), &message());
-                eprintln!("{line}");
+                tell(&line);
             }
             Output::Lines { .. } | Output::Quiet => {}
         }
@@ -74,8 +74,8 @@ impl Progress {
     /// Shows a line of its own, above the bar.
     pub fn note(&self, line: &str) {
         match &self.output {
-            Output::Bar(bar) => bar.suspend(|| eprintln!("{line}")),
-            Output::Lines { .. } => eprintln!("{line}"),
+            Output::Bar(bar) => bar.suspend(|| tell(line)),
+            Output::Lines { .. } => tell(line),
             Output::Quiet => {}
         }
     }
@@ -96,6 +96,11 @@ fn plain_line(done: u64, total: u64, here: u64, elapsed: Duration, message: &str
         line += &format!("  {:.0}s left", (total - done) as f64 / rate);
     }
     line
+}
+
+/// Writes a line that is no result. That nobody reads it (a closed pipe) is no error, and ends no run.
+pub(crate) fn tell(line: &str) {
+    let _ = writeln!(std::io::stderr(), "{line}");
 }
 
 #[cfg(test)]

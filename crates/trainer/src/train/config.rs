@@ -14,6 +14,9 @@ const LONGEST: usize = 1 << 20;
 /// More would leave no photo anything to see.
 const MOST_HALVINGS: u32 = 8;
 
+/// More steps are no run: at a thousand a second they take thirty years. Quarters of it and the like can be computed.
+pub(super) const MOST_STEPS: u64 = 1_000_000_000_000;
+
 /// Settings of a training run; together with the capture and the seed they repeat it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -192,6 +195,12 @@ impl TrainConfig {
         if let Some((field, _)) = counts.iter().find(|(_, value)| *value == 0) {
             return Some(format!("`{field}` must be at least 1"));
         }
+        if self.steps as u64 > MOST_STEPS {
+            return Some(format!(
+                "`steps` must be at most {MOST_STEPS}, it is {}",
+                self.steps
+            ));
+        }
         if self.downscale == 0 {
             return Some("`downscale` must be at least 1".into());
         }
@@ -332,6 +341,8 @@ mod tests {
             let found = problem(&|config| config.background = Some([0.0, value, 0.0]));
             assert!(found.contains("`background`"), "{found}");
         }
+        let found = problem(&|config| config.steps = usize::MAX);
+        assert!(found.contains("`steps` must be at most"), "{found}");
         let found = problem(&|config| config.density.grow_gradient = f64::NAN);
         assert!(found.contains("`density.grow_gradient`"), "{found}");
         let found = problem(&|config| config.density.prune_scale = -1.0);

@@ -5,11 +5,10 @@ use burn::tensor::{Bytes, DType};
 use burn_pack::{Reader, Scalar};
 
 use super::{History, Meta, SavedTensor};
+use crate::train::config::MOST_STEPS;
 
 /// More is no run but a damaged file: 300 years.
 const LONGEST_SECONDS: f64 = 1e10;
-/// More steps are none either: at a thousand a second they take thirty years.
-const MOST_STEPS: u64 = 1_000_000_000_000;
 /// Logs of edits, one per field.
 const EDIT_LOGS: usize = 6;
 
