@@ -54,7 +54,7 @@ pub enum OpError {
     },
     /// The lists of splats by tile need more memory than this process can get.
     #[error(
-        "{op}: {pairs} pairs of a tile and a splat that touches it need {needed} of memory, and {left} are left. \
+        "{op}: {pairs} pairs of a tile and a splat that touches it need {needed} of memory, and {left} can be had. \
          Render a smaller image, fewer cameras per call, or remove Gaussians: huge ones first"
     )]
     OutOfMemory {

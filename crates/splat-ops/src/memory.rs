@@ -41,7 +41,7 @@ pub fn available_memory() -> Option<u64> {
     .min()
 }
 
-/// The memory left, if `needed` bytes are more than that, or nearly so. What needs little of it does not measure anew every time.
+/// The memory that can be counted on, if `needed` bytes are more than that. What needs little of it does not measure anew every time.
 #[cfg(feature = "cpu")]
 pub(crate) fn lacking(needed: u64) -> Option<u64> {
     static LAST: Mutex<Option<(Instant, Option<u64>)>> = Mutex::new(None);
@@ -53,7 +53,8 @@ pub(crate) fn lacking(needed: u64) -> Option<u64> {
     if known.is_none() {
         *last = Some((Instant::now(), left));
     }
-    left.filter(|left| needed > (left - left / SLACK_SHARE).saturating_sub(RESERVE))
+    let usable = left.map(|left| (left - left / SLACK_SHARE).saturating_sub(RESERVE));
+    usable.filter(|usable| needed > *usable)
 }
 
 /// A size for messages.

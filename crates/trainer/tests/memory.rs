@@ -51,7 +51,7 @@ fn more_splats_per_tile_than_memory_holds_are_refused_in_one_line() {
     // 60,000 splats in each of 40 x 30 tiles.
     assert!(line.contains("72000000 pairs"), "{line}");
     assert!(
-        line.contains("1.7 GB of memory") && line.contains("left"),
+        line.contains("1.7 GB of memory") && line.contains("can be had"),
         "{line}"
     );
 }
