@@ -1,5 +1,6 @@
 //! Runs a target over and over: mutate, run, judge, and keep what reached something new.
 
+use std::cell::Cell;
 use std::collections::HashSet;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::io::{Seek, Write};
@@ -7,7 +8,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::PathBuf;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Weak};
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -259,30 +260,30 @@ fn hash_of(value: &impl Hash) -> u64 {
 struct Watch {
     path: PathBuf,
     file: Option<std::fs::File>,
-    /// Milliseconds since `start` at which the present input began; 0 between two.
-    began: Arc<AtomicU64>,
-    start: Instant,
+    /// Number of the present input, from 1; 0 between two.
+    present: Arc<AtomicU64>,
+    count: Cell<u64>,
 }
 
 impl Watch {
     fn new(name: &'static str) -> Self {
         let path = std::env::temp_dir().join(format!("splat-fuzz-{name}-{}", std::process::id()));
-        let (began, start) = (Arc::new(AtomicU64::new(0)), Instant::now());
-        let watched = Arc::downgrade(&began);
+        let present = Arc::new(AtomicU64::new(0));
+        let watched = Arc::downgrade(&present);
         let file = std::fs::File::create(&path).ok();
         let watched_path = path.clone();
-        std::thread::spawn(move || watch(&watched, start, &watched_path));
+        std::thread::spawn(move || watch(&watched, &watched_path));
         Self {
             path,
             file,
-            began,
-            start,
+            present,
+            count: Cell::new(0),
         }
     }
 
     fn begin(&self, input: &Input) {
-        let since = self.start.elapsed().as_millis() as u64;
-        self.began.store(since.max(1), Ordering::Relaxed);
+        self.count.set(self.count.get() + 1);
+        self.present.store(self.count.get(), Ordering::Relaxed);
         if let Some(mut file) = self.file.as_ref() {
             let bytes = input.0.concat();
             // Without the file a failure that aborts is repeated by its seed all the same.
@@ -294,22 +295,29 @@ impl Watch {
     }
 
     fn end(&self) {
-        self.began.store(0, Ordering::Relaxed);
+        self.present.store(0, Ordering::Relaxed);
     }
 }
 
-/// Looks at a campaign until it is gone.
-fn watch(began: &Weak<AtomicU64>, start: Instant, path: &std::path::Path) {
-    while let Some(began) = began.upgrade().map(|began| began.load(Ordering::Relaxed)) {
-        let now = start.elapsed().as_millis() as u64;
-        if began > 0 && Duration::from_millis(now.saturating_sub(began)) > LONGEST {
+/// Looks at a campaign until it is gone. Time is counted by the looks: none are taken while the process is stopped.
+fn watch(present: &Weak<AtomicU64>, path: &std::path::Path) {
+    const PAUSE: Duration = Duration::from_millis(500);
+    let (mut seen, mut time) = (0, Duration::ZERO);
+    while let Some(now) = present.upgrade().map(|input| input.load(Ordering::Relaxed)) {
+        time = match now {
+            0 => Duration::ZERO,
+            _ if now != seen => Duration::ZERO,
+            _ => time + PAUSE,
+        };
+        seen = now;
+        if time > LONGEST {
             eprintln!(
                 "an input takes more than {LONGEST:?}; its parts, joined, are in {}",
                 path.display()
             );
             std::process::exit(1);
         }
-        std::thread::sleep(Duration::from_millis(500));
+        std::thread::sleep(PAUSE);
     }
 }
 
