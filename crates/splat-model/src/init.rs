@@ -45,7 +45,9 @@ pub enum InitError {
     #[error("no points to start from; the capture needs SfM points (points3D)")]
     NoPoints,
     /// One is not finite.
-    #[error("point {index} has a position that is not finite; remove it from the capture")]
+    #[error(
+        "point {index} of the capture (points3D, counted from 0) lies beyond what 32-bit floats hold; remove it"
+    )]
     NotFinite {
         /// Which one.
         index: usize,

@@ -12,12 +12,12 @@
 //! | first scales | distances of the points; where all coincide, [`SceneScale::length`] ([`splats_from_points`](crate::splats_from_points)) |
 //! | distance from which coordinates count from an origin | [`SceneScale::origin`] |
 //! | thresholds of warnings | distances between the capture's own cameras and points |
-//! | orbit of `splat render` | the spread of the scene's own Gaussians |
+//! | orbit of `splat render` | the spread of the scene's own Gaussians, or else [`SceneScale::length`] |
 //!
 //! Absolute lengths that are left, and why: [`ProjectSettings::near`](splat_ops::ProjectSettings::near) and `far` of the
 //! bare op, whose caller knows the unit (0.01 and 1e10, as in gsplat); lengths in pixels (the low-pass filter, the largest
-//! size of a splat), which are the photo's; and 1, the size of a scene that has none (one camera in the place of its
-//! points).
+//! size of a splat), which are the photo's; the sizes that single precision has room for, from 1e-15 to 1e10; and 1, the
+//! size of a scene that has none (one camera in the place of its points).
 
 use glam::DVec3;
 use splat_ops::ProjectSettings;
@@ -41,6 +41,15 @@ impl SceneScale {
     const ORIGIN_FROM: f64 = 100.0;
     /// So many points tell the distance of a camera.
     const POINTS: usize = 4096;
+
+    /// Sizes that single precision can train: beyond, squares of gradients and of sizes leave its range. Tried from 1e-15
+    /// to 1e9.
+    const TRAINABLE: core::ops::RangeInclusive<f64> = 1e-15..=1e10;
+
+    /// Whether a scene of this size can be trained and rendered in single precision.
+    pub fn is_in_range(self) -> bool {
+        Self::TRAINABLE.contains(&self.0)
+    }
 
     /// A scene of this size; none where it is not positive and finite.
     pub fn new(length: f64) -> Option<Self> {
@@ -83,12 +92,16 @@ impl SceneScale {
     }
 
     /// The size of a scene that nothing is known of but its Gaussians: the median distance of the means from their
-    /// median.
+    /// median, or where all are in one place the median of their own sizes.
     pub fn of_splats(splats: &SplatData) -> Self {
         let every = splats.len().div_ceil(Self::POINTS).max(1);
         let means = splats.means.iter().step_by(every);
         let means = means.map(|mean| DVec3::from(mean.map(f64::from)));
-        Self::of_positions(means.collect()).unwrap_or(Self(1.0))
+        let largest = |scales: &[f32; 3]| f64::from(scales[0].max(scales[1]).max(scales[2])).exp();
+        let own = || Self::new(median(splats.log_scales.iter().map(largest)));
+        Self::of_positions(means.collect())
+            .or_else(own)
+            .unwrap_or(Self(1.0))
     }
 
     fn of_positions(positions: Vec<DVec3>) -> Option<Self> {

@@ -41,20 +41,25 @@ pub fn available_memory() -> Option<u64> {
     .min()
 }
 
-/// The memory that can be counted on, if `needed` bytes are more than that. What needs little of it does not measure anew every time.
+/// The memory that can be counted on, if `needed` bytes are more than that. What needs little of it does not measure anew
+/// every time, and what needs next to nothing is not asked for: a moment's shortage should not end a run.
 #[cfg(feature = "cpu")]
 pub(crate) fn lacking(needed: u64) -> Option<u64> {
+    if needed <= RESERVE / 2 {
+        return None;
+    }
     static LAST: Mutex<Option<(Instant, Option<u64>)>> = Mutex::new(None);
     let mut last = LAST.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
     let known = last.filter(|(at, left)| {
         at.elapsed() < FRESH && left.is_none_or(|left| needed <= left / LARGE_SHARE)
     });
-    let (_, left) = known.unwrap_or_else(|| (Instant::now(), available_memory()));
-    if known.is_none() {
-        *last = Some((Instant::now(), left));
-    }
+    let (at, left) = known.unwrap_or_else(|| (Instant::now(), available_memory()));
     let usable = left.map(|left| (left - left / SLACK_SHARE).saturating_sub(RESERVE));
-    usable.filter(|usable| needed > *usable)
+    let lacking = usable.filter(|usable| needed > *usable);
+    // What is granted now is not there for the next who asks.
+    let granted = if lacking.is_none() { needed } else { 0 };
+    *last = Some((at, left.map(|left| left.saturating_sub(granted))));
+    lacking
 }
 
 /// A size for messages.

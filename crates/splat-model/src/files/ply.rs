@@ -52,7 +52,13 @@ pub fn write(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
         path: path.to_path_buf(),
         source,
     };
-    let folder = match path.parent() {
+    // The file that a link points to, not the link.
+    let target = path
+        .is_symlink()
+        .then(|| path.canonicalize().ok())
+        .flatten();
+    let target = target.as_deref().unwrap_or(path);
+    let folder = match target.parent() {
         Some(folder) if !folder.as_os_str().is_empty() => folder,
         _ => Path::new("."),
     };
@@ -96,7 +102,8 @@ pub fn write(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
     out.flush().map_err(io_error)?;
     drop(out);
     file.as_file().sync_all().map_err(io_error)?;
-    file.persist(path).map_err(|error| io_error(error.error))?;
+    file.persist(target)
+        .map_err(|error| io_error(error.error))?;
     Ok(())
 }
 

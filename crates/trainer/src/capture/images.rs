@@ -67,20 +67,21 @@ pub(super) fn check_memory(
         bytes([camera.width, camera.height])
     };
     let Some(left) = left else { return Ok(()) };
-    // Photos may be smaller than their cameras say; but to look at each takes time.
-    if model
-        .images
-        .iter()
-        .map(of_camera)
-        .fold(0, u64::saturating_add)
-        <= left
-    {
+    // Photos may have another size than their cameras; but to look at each takes time, and mostly there is far more memory
+    // than they take.
+    const AMPLE: u64 = 64;
+    let by_cameras = model.images.iter().map(of_camera);
+    if by_cameras.fold(0, u64::saturating_add) <= left / AMPLE {
         return Ok(());
     }
-    let of_photo = |image: &Image| match image::image_dimensions(folder.join(&image.name)) {
-        Ok((width, height)) => bytes([width, height]),
-        // Told when it is decoded.
-        Err(_) => 0,
+    let size = |path: &Path| -> Option<(u32, u32)> {
+        let reader = ImageReader::open(path).ok()?;
+        // By what is in the file, whatever its name.
+        reader.with_guessed_format().ok()?.into_dimensions().ok()
+    };
+    // What cannot be read is told when it is decoded.
+    let of_photo = |image: &Image| {
+        size(&folder.join(&image.name)).map_or(0, |(width, height)| bytes([width, height]))
     };
     let photos = model.images.par_iter().map(of_photo);
     let needed = photos.reduce(|| 0, u64::saturating_add);

@@ -66,7 +66,7 @@ pub(super) fn run(args: &EvalArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let (gaussians, settings) = scene::open(&args.scene, &device, args.sh_precision, global)?;
     probe_files([&args.json])?;
     let scores = evaluate(&gaussians, &views, &settings, &device, |_, _| {})?;
-    print(&table(&scores));
+    print(&table(&scores))?;
     if let Some(path) = &args.json {
         write_json(path, &scores)?;
     }

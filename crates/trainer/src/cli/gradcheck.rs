@@ -87,7 +87,7 @@ pub(super) fn run(args: &GradcheckArgs, global: &GlobalArgs) -> Result<(), Failu
         .iter()
         .map(|path| check_file(path, &device, precision, bug))
         .collect::<Result<Vec<_>, _>>()?;
-    print(&gradcheck::table(&reports));
+    print(&gradcheck::table(&reports))?;
     if let Some(path) = &args.json {
         write_json(path, &gradcheck::json(&reports))?;
     }

@@ -36,7 +36,7 @@ pub(super) fn run(args: &InfoArgs, _: &GlobalArgs) -> Result<(), Failure> {
         args.photos.refuse("a scene has no photos")?;
         scene::describe(path, &scene)
     };
-    print(&text);
+    print(&text)?;
     Ok(())
 }
 

@@ -93,10 +93,16 @@ impl GlobalArgs {
     }
 }
 
-/// Prints results. That nobody reads them (a closed pipe) is no error.
-fn print(text: &str) {
+/// Prints results. That nobody reads them (a closed pipe) is no error; that they are lost is one.
+fn print(text: &str) -> Result<(), Failure> {
     let mut out = std::io::stdout().lock();
-    let _ = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+    let written = out.write_all(text.as_bytes()).and_then(|()| out.flush());
+    match written {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(Failure::BadInput(
+            format!("the results could not be printed: {error}"),
+        )),
+        _ => Ok(()),
+    }
 }
 
 #[cfg(test)]

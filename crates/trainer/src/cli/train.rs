@@ -207,7 +207,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     }
     let trained = trainer.run();
     progress.borrow().finish();
-    let trained = trained?;
+    let trained = trained.map_err(|error| folder.stopped(error.into()))?;
 
     if trained.steps < config.steps {
         folder.interrupted(&trained)?;
@@ -219,7 +219,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     }
     let (scores, saved) = folder.complete(&trained, &capture, &config, &chosen);
     if let Some(scores) = scores.filter(|scores| !scores.views.is_empty()) {
-        print(&eval::table(&scores));
+        print(&eval::table(&scores))?;
     }
     saved?;
     print(&format!(
@@ -228,7 +228,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         trained.steps,
         trained.elapsed.as_secs_f64(),
         out.display()
-    ));
+    ))?;
     Ok(())
 }
 

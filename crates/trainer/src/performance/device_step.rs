@@ -76,6 +76,18 @@ pub struct DeviceStepRow {
     pub memory: DeviceMemory,
 }
 
+/// Whether a device is none of its own, but a program on the host.
+fn is_software(device: &Device) -> bool {
+    #[cfg(feature = "wgpu")]
+    let is_physical = device
+        .identity()
+        .is_some_and(|known| known.physical.is_some());
+    // There is none without the feature that reaches it.
+    #[cfg(not(feature = "wgpu"))]
+    let is_physical = matches!(device, _ if false);
+    !is_physical
+}
+
 /// Measures steps of `capture` on `device` at degree 0, with which training begins, and 3, with which it ends. `seconds`
 /// bounds the time of each way of measuring, as far as three steps do.
 ///
@@ -90,9 +102,7 @@ pub fn measure(
 ) -> Result<DeviceStepReport, PerformanceError> {
     let facts = describe(device).ok_or(PerformanceError::NotCubeCl)?;
     say("copying, for the device's memory bandwidth");
-    let software = device
-        .identity()
-        .is_none_or(|known| known.physical.is_none());
+    let software = is_software(device);
     let bytes = if software {
         SOFTWARE_COPY_BYTES
     } else {

@@ -194,6 +194,9 @@ impl Checkpoint {
             path: path.to_path_buf(),
             reason,
         };
+        // What could not be read again must not replace what can.
+        check::tensors(&self.tensors)
+            .map_err(|reason| format(format!("the run has left all bounds: {reason}")))?;
         let bytes: Vec<(&str, &[usize], Vec<u8>)> = self
             .tensors
             .iter()

@@ -11,6 +11,8 @@ pub(super) struct Fingerprint {
     /// Name of its folder, for words only: folders are moved.
     name: String,
     points: usize,
+    /// Checksum of the points' positions, to the bit: the scene's size is made of them.
+    positions: u32,
     views: Vec<ViewPrint>,
 }
 
@@ -47,6 +49,7 @@ impl Fingerprint {
         Self {
             name: capture.name.clone(),
             points: capture.points.len(),
+            positions: positions(capture),
             views,
         }
     }
@@ -106,10 +109,11 @@ impl Fingerprint {
                 return Some(format!("photo `{name}`{others} is {is}, it was {was}"));
             }
         }
-        (self.points != given.points).then(|| {
+        if self.points != given.points {
             let (is, was) = (given.points, self.points);
-            format!("it has {is} points, it had {was}")
-        })
+            return Some(format!("it has {is} points, it had {was}"));
+        }
+        (self.positions != given.positions).then(|| "its points lie in other places".to_owned())
     }
 
     /// Names of the photos of `given`, the same capture, whose pixels are others.
@@ -118,6 +122,16 @@ impl Fingerprint {
         let changed = pairs.filter(|(was, is)| was.photo != is.photo);
         changed.map(|(_, is)| is.name.clone()).collect()
     }
+}
+
+fn positions(capture: &Capture) -> u32 {
+    let mut hasher = crc32fast::Hasher::new();
+    for point in &capture.points {
+        for value in point.position {
+            hasher.update(&value.to_le_bytes());
+        }
+    }
+    hasher.finalize()
 }
 
 impl ViewPrint {

@@ -57,6 +57,16 @@ pub enum TrainError {
         /// What is wrong with them.
         source: InitError,
     },
+    /// The scene is too small or too large for single precision.
+    #[error(
+        "{capture}: the scene is {size:.1e} units large, single precision has room for 1e-15 to 1e10; give cameras and points in another unit"
+    )]
+    SceneSize {
+        /// The capture's folder.
+        capture: PathBuf,
+        /// Its size, see [`SceneScale`].
+        size: f64,
+    },
     /// A setting is out of range.
     #[error("configuration: {0}")]
     Config(String),
@@ -273,6 +283,12 @@ impl TrainerBuilder {
             scene_scale: SceneScale::of_capture(&cameras, &points),
             seed: self.config.seed,
         };
+        if !run.scene_scale.is_in_range() {
+            return Err(TrainError::SceneSize {
+                capture: capture.root.clone(),
+                size: run.scene_scale.length(),
+            });
+        }
         let device = self.device.without_autodiff().autodiff();
         let mut record = RunRecord {
             capture: Fingerprint::of(&capture),
@@ -439,6 +455,30 @@ impl Trainer {
             let found = warnings::start::inspect(&self.capture, &self.gaussians, &self.config);
             found.into_iter().for_each(|warning| self.warn(warning));
         }
+        if let Err(error) = self.advance() {
+            self.rescue(&error);
+            return Err(error);
+        }
+        Ok(Trained {
+            settings: SceneSettings {
+                scene_scale: Some(self.run.scene_scale.length()),
+                antialias: Some(self.config.antialias),
+                background: Some(self.config.background.unwrap_or_default()),
+                ..SceneSettings::default()
+            },
+            gaussians: self.gaussians.valid(),
+            history: self.state.history.clone(),
+            render_settings: self
+                .config
+                .render_settings(SH_DEGREE_MAX, self.run.scene_scale),
+            steps: self.state.step,
+            elapsed: self.state.elapsed,
+            state: (self.gaussians, self.state, self.record),
+        })
+    }
+
+    /// Takes the steps that are left, until interrupted.
+    fn advance(&mut self) -> Result<(), TrainError> {
         while self.state.step < self.config.steps && !self.should_stop() {
             self.step()?;
             let last = self.state.step == self.config.steps;
@@ -460,22 +500,18 @@ impl Trainer {
             });
         }
         self.read_losses()?;
-        Ok(Trained {
-            settings: SceneSettings {
-                scene_scale: Some(self.run.scene_scale.length()),
-                antialias: Some(self.config.antialias),
-                background: Some(self.config.background.unwrap_or_default()),
-                ..SceneSettings::default()
-            },
-            gaussians: self.gaussians.valid(),
-            history: self.state.history.clone(),
-            render_settings: self
-                .config
-                .render_settings(SH_DEGREE_MAX, self.run.scene_scale),
-            steps: self.state.step,
-            elapsed: self.state.elapsed,
-            state: (self.gaussians, self.state, self.record),
-        })
+        Ok(())
+    }
+
+    /// Keeps what was done before a step that failed, if there is a place for it. A loss that is not finite is no reason
+    /// to replace a state of before it.
+    fn rescue(&mut self, error: &TrainError) {
+        let diverged = matches!(error, TrainError::NotFinite { .. });
+        if self.state.step > 0 && self.is_at_rest() && !diverged {
+            // What cannot be read any more is not what is to be kept.
+            let _ = self.read_losses();
+            self.save();
+        }
     }
 
     fn should_stop(&self) -> bool {
@@ -495,8 +531,14 @@ impl Trainer {
         }
         // The losses up to here are part of the checkpoint.
         self.read_losses()?;
+        self.save();
+        Ok(())
+    }
+
+    /// Keeps the present state where the run's are kept. Says if it cannot be, and goes on.
+    fn save(&mut self) {
         let Some(autosave) = &mut self.autosave else {
-            return Ok(());
+            return;
         };
         let saved = Checkpoint::of(&self.gaussians, &self.state, &self.record)
             .and_then(|checkpoint| (autosave.save)(&checkpoint));
@@ -512,7 +554,6 @@ impl Trainer {
                 reason: error.to_string(),
             });
         }
-        Ok(())
     }
 
     /// Takes the next step of the run, for whoever drives the loop instead of [`run`](Self::run), which also
@@ -806,8 +847,7 @@ mod tests {
 
         let mut damaged = first.checkpoint().unwrap();
         damaged.drop_row("quats");
-        damaged.save(&path).unwrap();
-        let error = Checkpoint::load(&path).unwrap_err().to_string();
+        let error = damaged.save(&path).unwrap_err().to_string();
         assert!(error.contains("`quats` has shape"), "{error}");
 
         // A bit that is lost anywhere is noticed.

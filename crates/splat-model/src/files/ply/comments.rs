@@ -18,6 +18,7 @@ use std::path::Path;
 use std::str::FromStr;
 
 use super::super::{SceneFileError, SceneSettings, SplatData};
+use crate::SceneScale;
 
 /// First word of our comments.
 const OURS: &str = "burn-splat";
@@ -41,7 +42,7 @@ pub(super) fn write(path: &Path, scene: &SplatData) -> Result<Vec<String>, Scene
     let settings = &scene.settings;
     if let Some(scale) = settings.scene_scale {
         if !is_scale(scale) {
-            return Err(bad("scene_scale", &scale, "positive and finite"));
+            return Err(bad("scene_scale", &scale, "from 1e-15 to 1e10"));
         }
         comments.push(format!("{OURS} scene_scale {scale:e}"));
     }
@@ -116,7 +117,7 @@ impl Found {
                 let scale = scale.filter(|scale| is_scale(*scale));
                 set(
                     &mut self.scene_scale,
-                    scale.ok_or("not one positive finite number")?,
+                    scale.ok_or("not one number from 1e-15 to 1e10")?,
                 )?;
             }
             "antialias" => set(&mut self.antialias, bit(values).ok_or("neither 0 nor 1")?)?,
@@ -189,5 +190,5 @@ fn bit(words: &[&str]) -> Option<bool> {
 }
 
 fn is_scale(scale: f64) -> bool {
-    scale.is_finite() && scale > 0.0
+    SceneScale::new(scale).is_some_and(SceneScale::is_in_range)
 }

@@ -38,7 +38,7 @@ pub(super) fn run(args: &AccuracyArgs, global: &GlobalArgs) -> Result<(), Failur
             case.number, backend.name, case.name
         ));
     })?;
-    print(&report.markdown());
+    print(&report.markdown())?;
     if let Some(path) = &args.json {
         write_json(path, &report)?;
     }

@@ -55,7 +55,7 @@ pub(super) fn run(args: &PerformanceArgs, global: &GlobalArgs) -> Result<(), Fai
         scaling: scaling::report(&GAUSSIANS, &PIXELS.map(PhotoSize::of_pixels), global)?,
     };
     let text = page(args, &report);
-    print(&text);
+    print(&text)?;
     if let Some(path) = &args.json {
         write_json(path, &report)?;
     }

@@ -57,7 +57,7 @@ pub(super) fn run(args: &RasterizeArgs, global: &GlobalArgs) -> Result<(), Failu
         &args.input,
         global,
     )?;
-    print(&format!("{}\n{}", report.machine.line(), report.markdown()));
+    print(&format!("{}\n{}", report.machine.line(), report.markdown()))?;
     if let Some(path) = &args.json {
         write_json(path, &report)?;
     }

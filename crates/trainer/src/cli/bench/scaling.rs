@@ -75,7 +75,7 @@ pub(super) fn run_synthetic(args: &SyntheticArgs) -> Result<(), Failure> {
     }
     probe_folder(&args.out)?;
     synthetic_capture(args.gaussians, args.pixels).save(&args.out)?;
-    print(&format!("{}\n", args.out.display()));
+    print(&format!("{}\n", args.out.display()))?;
     Ok(())
 }
 
@@ -91,7 +91,7 @@ pub(super) fn run(args: &ScalingArgs, global: &GlobalArgs) -> Result<(), Failure
     check_gaussians("--gaussians", &args.gaussians)?;
     probe_files([&args.json, &args.svg])?;
     let report = report(&args.gaussians, &args.pixels, global)?;
-    print(&format!("{}\n{}", report.machine.line(), report.markdown()));
+    print(&format!("{}\n{}", report.machine.line(), report.markdown()))?;
     if let Some(path) = &args.json {
         write_json(path, &report)?;
     }
@@ -104,7 +104,7 @@ pub(super) fn run(args: &ScalingArgs, global: &GlobalArgs) -> Result<(), Failure
 /// Measures a point in this process.
 pub(super) fn run_point(args: &PointArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let point = measure_point(args.gaussians, args.pixels, &chosen(global)?)?;
-    print(&serde_json::to_string(&point)?);
+    print(&serde_json::to_string(&point)?)?;
     Ok(())
 }
 

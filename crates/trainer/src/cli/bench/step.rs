@@ -49,14 +49,14 @@ pub(super) fn run(args: &StepArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let (seconds, say) = (args.input.seconds, |line: &str| global.say(line));
     if on_device {
         let report = device_step::measure(&capture, &config, &device, seconds, say)?;
-        print(&format!("{}\n{}", report.machine.line(), report.markdown()));
+        print(&format!("{}\n{}", report.machine.line(), report.markdown()))?;
         if let Some(path) = &args.json {
             write_json(path, &report)?;
         }
         return Ok(());
     }
     let report = step::measure(&capture, &config, seconds, say)?;
-    print(&format!("{}\n{}", report.machine.line(), report.markdown()));
+    print(&format!("{}\n{}", report.machine.line(), report.markdown()))?;
     if let Some(path) = &args.json {
         write_json(path, &report)?;
     }

@@ -106,8 +106,9 @@ pub(super) fn orbit(scene: &SplatData, count: u32) -> Vec<(String, Camera)> {
     }));
     let distance = |mean: &[f32; 3]| DVec3::from(mean.map(f64::from)).distance(middle);
     let reach = quantile(scene.means.iter().map(distance), 0.9);
-    // One Gaussian, or all in one place: any distance does.
-    let reach = if reach > 0.0 { reach } else { 1.0 };
+    // One Gaussian, or all in one place.
+    let size = scene.scene_scale().length();
+    let reach = if reach > 0.0 { reach } else { size };
     // A sphere of that radius just fits the picture's height.
     let half_height = f64::from(ORBIT_SIZE.height) / 2.0;
     let radius = reach * (ORBIT_FOCAL / half_height).hypot(1.0);

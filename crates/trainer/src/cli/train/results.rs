@@ -84,6 +84,18 @@ impl RunFolder<'_> {
             .any(|name| self.folder.join(name).exists())
     }
 
+    /// The error of a run that could not go on, with the way to go on from what was kept of it.
+    pub(super) fn stopped(&self, error: Failure) -> Failure {
+        if !self.folder.join(CHECKPOINT).is_file() {
+            return error;
+        }
+        Failure::BadInput(format!(
+            "{}; what was done before is kept, go on with: {}",
+            error.reason(),
+            self.resume
+        ))
+    }
+
     /// Keeps an interrupted run.
     pub(super) fn interrupted(&self, trained: &Trained) -> Result<(), Failure> {
         let mut saving = Saving::default();
@@ -105,6 +117,11 @@ impl RunFolder<'_> {
     ) -> (Option<Scores>, Result<(), Failure>) {
         let mut saving = Saving::default();
         let scene = self.save_scene(&mut saving, trained);
+        if !scene && self.folder.join(SCENE).exists() {
+            // Beside the scene of another run nothing of this one may lie but what it can be gone on with from.
+            saving.keep(CHECKPOINT, self.save_checkpoint(trained));
+            return (None, self.outcome(saving));
+        }
         self.save_course(&mut saving, trained, scene);
         let scores = self.save_views(&mut saving, trained, capture, chosen);
         if let Some(scores) = &scores {

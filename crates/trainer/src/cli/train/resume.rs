@@ -46,7 +46,7 @@ fn not_resumable(given: &Path, checkpoint: &Path) -> Option<String> {
         if checkpoint.exists() {
             return None;
         }
-        if given.join(METRICS).exists() {
+        if given.join(METRICS).exists() && given.join(SCENE).exists() {
             return Some(
                 "the run in this folder is complete, nothing is left to go on with; to train longer, begin a run \
                  with more --steps in another folder"

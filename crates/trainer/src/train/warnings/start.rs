@@ -56,7 +56,7 @@ pub(in crate::train) fn inspect(
         .collect();
     let distance = median(outlooks.iter().map(|outlook| outlook.middle));
     let mut warnings = Vec::new();
-    warnings.extend(crowded(&positions, distance));
+    warnings.extend(crowded(&positions, gaussians.origin.into(), distance));
     warnings.extend(large(gaussians, config, distance));
     warnings.extend(cameras(capture, &outlooks));
     warnings.extend(noise(&capture.views));
@@ -91,12 +91,12 @@ impl Outlook {
     }
 }
 
-fn crowded(positions: &[DVec3], distance: f64) -> Option<Warning> {
+fn crowded(positions: &[DVec3], origin: DVec3, distance: f64) -> Option<Warning> {
     let points = positions.len();
-    // As the model has them, in single precision.
+    // As the model has them, from its origin and in single precision.
     let places: HashSet<_> = positions
         .iter()
-        .map(|p| p.as_vec3().to_array().map(f32::to_bits))
+        .map(|p| (*p - origin).as_vec3().to_array().map(f32::to_bits))
         .collect();
     let count = points - places.len();
     if count as f64 >= COINCIDENT * points as f64 {
