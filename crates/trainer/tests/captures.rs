@@ -159,3 +159,36 @@ fn photos_may_lie_in_a_folder_of_another_name() {
         assert!(line.contains("--images"), "{line}");
     }
 }
+
+/// Neither by pictures of all views nor by those of the held-out ones.
+#[test]
+fn no_photo_is_replaced_by_a_picture() {
+    let folder = TempDir::new().unwrap();
+    let capture = small_example(folder.path(), ["0.png", "1.png", "2.png", "3.png"]);
+    let out = folder.path().join("out");
+    said(&["train", text(&capture), "--out", text(&out), "--steps", "1"]);
+    let scene = out.join("scene.ply");
+    fs::rename(capture.join("images"), capture.join("views")).unwrap();
+    let photos = capture.join("views");
+    let bytes = |name: &str| fs::read(photos.join(name)).unwrap();
+    let before = bytes("0.png");
+
+    let views = ["--capture", text(&capture), "--images", "views"];
+    let render = ["render", text(&scene), "--out", text(&photos)];
+    let train = ["train", text(&capture), "--images", "views", "--steps", "1"];
+    for arguments in [
+        [&render[..], &views[..]].concat(),
+        [&train[..], &["--out", text(&capture)]].concat(),
+    ] {
+        let line = refusal(&arguments);
+        assert!(
+            line.contains("0.png") && line.contains("the command reads this file"),
+            "{line}"
+        );
+        assert_eq!(bytes("0.png"), before);
+    }
+    let json = ["eval", text(&capture), text(&scene), "--images", "views"];
+    let line = refusal(&[&json[..], &["--json", text(&scene)]].concat());
+    assert!(line.contains("scene.ply"), "{line}");
+    assert!(fs::read(&scene).unwrap().starts_with(b"ply"));
+}

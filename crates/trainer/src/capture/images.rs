@@ -3,7 +3,7 @@
 mod folders;
 
 use std::io::Cursor;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use image::{DynamicImage, ImageError, ImageFormat, ImageReader};
@@ -16,14 +16,23 @@ use super::{CaptureError, CaptureOptions, CaptureWarning, View, downscale, jpeg}
 /// Least width and height of a photo: the window of SSIM.
 pub(super) const MIN_SIDE: u32 = 11;
 
+/// The folder of the photos.
+pub(super) fn folder(
+    root: &Path,
+    model: &SparseModel,
+    options: &CaptureOptions,
+) -> Result<PathBuf, CaptureError> {
+    folders::of_photos(root, options.images.as_deref(), model)
+}
+
 /// Loads the photo of every image of the model. The views come in the order of the model's images.
 pub(super) fn load(
     root: &Path,
+    folder: &Path,
     model: &SparseModel,
     options: &CaptureOptions,
     warnings: &mut Vec<CaptureWarning>,
 ) -> Result<Vec<View>, CaptureError> {
-    let folder = folders::of_photos(root, options.images.as_deref(), model)?;
     // Look for every photo before decoding any: the likeliest mistake is found at once.
     for image in &model.images {
         let path = folder.join(&image.name);
@@ -31,22 +40,22 @@ pub(super) fn load(
             return Err(CaptureError::MissingPhoto {
                 path,
                 image: image.name.clone(),
-                elsewhere: folders::elsewhere(root, &folder, model),
+                elsewhere: folders::elsewhere(root, folder, model),
             });
         }
     }
     let factor = options.downscale;
-    check_memory(root, &folder, model, factor, available_memory())?;
+    check_memory(root, folder, model, factor, available_memory())?;
     let loaded: Vec<Result<Loaded, CaptureError>> = model
         .images
         .par_iter()
-        .map(|image| load_one(&folder, image, &model.cameras[&image.camera_id], factor))
+        .map(|image| load_one(folder, image, &model.cameras[&image.camera_id], factor))
         .collect();
     let loaded = loaded.into_iter().collect::<Result<Vec<_>, _>>()?;
     warnings.extend(rescaled(&loaded));
     warnings.extend(transparent(&loaded));
     warnings.extend(damaged(&loaded));
-    warnings.extend(folders::unregistered(root, &folder, model));
+    warnings.extend(folders::unregistered(root, folder, model));
     Ok(loaded.into_iter().map(|loaded| loaded.view).collect())
 }
 

@@ -20,6 +20,7 @@ pub fn parse(binary: bool, files: [&[u8]; 3]) -> Result<Capture, CaptureError> {
     Ok(Capture {
         name: "memory".into(),
         root: PathBuf::from("memory"),
+        photos: PathBuf::from("memory"),
         split: Split {
             train: (0..views.len()).collect(),
             test: vec![],

@@ -32,6 +32,8 @@ pub struct Capture {
     pub name: String,
     /// The folder that was read.
     pub root: PathBuf,
+    /// The folder of the photos.
+    pub photos: PathBuf,
     /// All views, sorted by [`View::name`]. Never empty.
     pub views: Vec<View>,
     /// Points of structure from motion, in file order. Never empty.
@@ -108,12 +110,14 @@ impl Capture {
             return Err(CaptureError::ZeroDownscale);
         }
         let (model, mut warnings) = colmap::read(root)?;
-        let views = images::load(root, &model, options, &mut warnings)?;
+        let photos = images::folder(root, &model, options)?;
+        let views = images::load(root, &photos, &model, options, &mut warnings)?;
         let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
         let split = Split::of_capture(root, &names, &mut warnings)?;
         Ok(Self {
             name: folder_name(root),
             root: root.to_path_buf(),
+            photos,
             split,
             points: model.points,
             views,
@@ -134,6 +138,12 @@ impl Capture {
             });
         }
         Ok(())
+    }
+
+    /// The files of the photos, in the order of the views.
+    pub fn photo_files(&self) -> Vec<PathBuf> {
+        let file = |view: &View| self.photos.join(&view.name);
+        self.views.iter().map(file).collect()
     }
 
     /// The views to train on, in the order of their names.

@@ -9,7 +9,7 @@ use super::photos::PhotoArgs;
 use super::{Failure, GlobalArgs, device, print, scene};
 use crate::capture::View;
 use crate::report::metrics::write_json;
-use crate::report::probe_files;
+use crate::report::{probe_files, refuse_inputs};
 use crate::{Scores, evaluate};
 
 /// Measure PSNR and SSIM of a scene on a capture's held-out views
@@ -65,6 +65,7 @@ pub(super) fn run(args: &EvalArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let device = device::open(global)?.device;
     let (gaussians, settings) = scene::open(&args.scene, &device, args.sh_precision, global)?;
     probe_files([&args.json])?;
+    refuse_inputs(args.json.clone(), [args.scene.as_path()])?;
     let scores = evaluate(&gaussians, &views, &settings, &device, |_, _| {})?;
     print(&table(&scores))?;
     if let Some(path) = &args.json {

@@ -7,6 +7,7 @@ use clap::{Args, ValueEnum};
 use super::{Failure, GlobalArgs, device, print};
 use crate::gradcheck::{self, Bug, check_file};
 use crate::report::metrics::write_json;
+use crate::report::{probe_files, refuse_inputs};
 
 /// Check every gradient against fixtures written by PyTorch
 #[derive(Debug, Args)]
@@ -82,6 +83,8 @@ pub(super) fn run(args: &GradcheckArgs, global: &GlobalArgs) -> Result<(), Failu
     if let Some(bug) = bug {
         global.say(format_args!("with a known bug switched on: {bug:?}"));
     }
+    probe_files([&args.json])?;
+    refuse_inputs(args.json.clone(), args.files.iter().map(PathBuf::as_path))?;
     let reports = args
         .files
         .iter()

@@ -13,9 +13,9 @@ use splat_model::{CameraTensors, Gaussians, RenderSettings, project_gaussians, r
 use super::photos::PhotoArgs;
 use super::{Failure, GlobalArgs, device, scene};
 use crate::report::png::Picture;
-use crate::report::probe_folder;
 use crate::report::progress::Progress;
 use crate::report::view_names::ViewNames;
+use crate::report::{probe_folder, refuse_inputs};
 
 /// Render pictures of a scene
 #[derive(Debug, Args)]
@@ -86,11 +86,16 @@ pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure>
     if args.cameras.capture.is_none() {
         args.photos.refuse("of use with --capture only")?;
     }
+    let mut inputs = vec![args.scene.clone()];
     let cameras = match &args.cameras {
         CameraArgs {
             capture: Some(path),
             ..
-        } => cameras::of_capture(&args.photos.open(path, global)?),
+        } => {
+            let capture = args.photos.open(path, global)?;
+            inputs.extend(capture.photo_files());
+            cameras::of_capture(&capture)
+        }
         CameraArgs {
             camera: Some(path), ..
         } => cameras::of_file(path)?,
@@ -107,6 +112,14 @@ pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure>
     if let Some(note) = names.note() {
         global.say(note);
     }
+    let pictures_of = |stem: &str| {
+        let names = suffixes
+            .iter()
+            .map(move |suffix| format!("{stem}{suffix}.png"));
+        names.map(|name| args.out.join(name)).collect::<Vec<_>>()
+    };
+    let outputs = names.stems.iter().flat_map(|stem| pictures_of(stem));
+    refuse_inputs(outputs, inputs.iter().map(PathBuf::as_path))?;
     for (done, ((name, camera), stem)) in cameras.iter().zip(&names.stems).enumerate() {
         let camera = camera.relative_to(gaussians.origin).tensors(&device);
         for (channel, picture) in pictures(&gaussians, &camera, &settings, &args.channels)? {

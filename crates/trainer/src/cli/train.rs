@@ -198,7 +198,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         resume: &resume,
         global,
     };
-    folder.probe()?;
+    folder.probe(&capture)?;
     if fresh && folder.is_taken() {
         global.say(format_args!(
             "{}: the results of an earlier run are replaced when this one ends or is interrupted",

@@ -5,6 +5,7 @@
 
 mod atomic;
 pub mod curves;
+mod inputs;
 pub mod losses;
 pub mod memory;
 pub mod metrics;
@@ -15,6 +16,7 @@ pub mod view_names;
 use std::path::PathBuf;
 
 pub use atomic::{probe_file, probe_files, probe_folder, write_atomically, write_durably};
+pub use inputs::refuse_inputs;
 
 /// Why a report could not be written. Every message is one line that names the file.
 #[derive(Debug, thiserror::Error)]
@@ -27,6 +29,12 @@ pub enum ReportError {
         path: PathBuf,
         /// What the system said.
         source: std::io::Error,
+    },
+    /// The file is one that the command reads.
+    #[error("{}: the command reads this file, and would replace it; write to another place", path.display())]
+    Input {
+        /// The file.
+        path: PathBuf,
     },
     /// The contents could not be encoded.
     #[error("{}: {reason}", path.display())]

@@ -18,7 +18,7 @@ use crate::report::memory::peak_rss_bytes;
 use crate::report::metrics::{Metrics, write_json};
 use crate::report::png::Picture;
 use crate::report::view_names::ViewNames;
-use crate::report::{ReportError, probe_file, probe_folder, write_durably};
+use crate::report::{ReportError, probe_file, probe_folder, refuse_inputs, write_durably};
 use crate::train::{CheckpointError, History, TrainConfig, Trained};
 use crate::{Scores, evaluate};
 
@@ -64,8 +64,12 @@ impl Saving {
 }
 
 impl RunFolder<'_> {
-    /// Tries whether everything can be written, before it is worth anything.
-    pub(super) fn probe(&self) -> Result<(), ReportError> {
+    /// Tries whether everything can be written, before it is worth anything, and without replacing a photo.
+    pub(super) fn probe(&self, capture: &Capture) -> Result<(), ReportError> {
+        let pictures = picture_names(capture).stems;
+        let pictures = pictures.iter().map(|stem| self.picture(stem));
+        let photos = capture.photo_files();
+        refuse_inputs(pictures, photos.iter().map(PathBuf::as_path))?;
         probe_folder(self.folder)?;
         for name in [SCENE, CHECKPOINT, CONFIG, METRICS, LOSSES, CURVES] {
             probe_file(&self.folder.join(name))?;
@@ -75,6 +79,11 @@ impl RunFolder<'_> {
             true => probe_folder(&views),
             false => Ok(()),
         }
+    }
+
+    /// The picture of a view.
+    fn picture(&self, stem: &str) -> PathBuf {
+        self.folder.join(VIEWS).join(format!("{stem}.png"))
     }
 
     /// Whether another run's results lie here.
@@ -188,11 +197,11 @@ impl RunFolder<'_> {
         let mut stems = names.stems.iter();
         let mut pictures = Vec::new();
         let mut written = Ok(());
-        let folder = self.folder.join(VIEWS);
         let keep = |view: &View, rendered: Vec<f32>| {
             let Some(stem) = stems.next() else { return };
-            match write_view(&folder, stem, view, &rendered) {
-                Ok(path) => pictures.push(path),
+            let path = self.picture(stem);
+            match write_view(&path, view, &rendered) {
+                Ok(()) => pictures.push(path),
                 Err(error) if written.is_ok() => written = Err(error),
                 Err(_) => {}
             }
@@ -226,7 +235,7 @@ impl RunFolder<'_> {
         others.sort();
         if let Some(name) = others.first().and_then(|path| path.file_name()) {
             self.global.say(format_args!(
-                "warning: {}: {} picture(s) are not of this scene but of an earlier one, from `{}`; remove them",
+                "warning: {}: {} picture(s) were there before and are not of this scene, `{}` first",
                 folder.display(),
                 others.len(),
                 name.display()
@@ -285,18 +294,11 @@ pub(super) fn picture_names(capture: &Capture) -> ViewNames {
     ViewNames::new(names, &[""])
 }
 
-/// Writes truth beside render, and returns where.
-fn write_view(
-    folder: &Path,
-    stem: &str,
-    view: &View,
-    rendered: &[f32],
-) -> Result<PathBuf, ReportError> {
+/// Writes truth beside render.
+fn write_view(path: &Path, view: &View, rendered: &[f32]) -> Result<(), ReportError> {
     let truth = Picture::from_rgb8(view.width, view.height, view.image.to_vec())?;
     let render = Picture::from_rgb_f32(view.width, view.height, rendered)?;
-    let path = folder.join(format!("{stem}.png"));
-    truth.beside(&render)?.write(&path)?;
-    Ok(path)
+    truth.beside(&render)?.write(path)
 }
 
 /// The course of the run: the weighted sum, then each term.

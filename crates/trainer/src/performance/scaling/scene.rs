@@ -106,6 +106,7 @@ pub fn synthetic_capture(gaussians: usize, size: PhotoSize) -> Capture {
     Capture {
         name: "synthetic".to_owned(),
         root: PathBuf::from("synthetic"),
+        photos: PathBuf::from("synthetic"),
         views,
         points,
         split: Split {
