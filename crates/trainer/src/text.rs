@@ -29,6 +29,11 @@ pub(crate) fn utf8(bytes: &[u8]) -> Result<&str, String> {
         .map_err(|error| format!("no text in UTF-8 ({error}); save it as such"))
 }
 
+/// A message in one line: those of libraries span several.
+pub(crate) fn one_line(message: &str) -> String {
+    message.split_whitespace().collect::<Vec<_>>().join(" ")
+}
+
 /// Lines with their index from 0. They end as on Unix or Windows, or as on an old Mac where no other end is found.
 pub(crate) fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, &[u8])> {
     let end = if bytes.contains(&b'\n') { b'\n' } else { b'\r' };

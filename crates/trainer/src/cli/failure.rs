@@ -3,6 +3,8 @@
 use std::fmt;
 use std::process::ExitCode;
 
+use crate::text::one_line;
+
 /// Why a command did not succeed. `Display` is the one line for the user.
 #[derive(Debug)]
 pub enum Failure {
@@ -20,9 +22,7 @@ impl Failure {
             Self::BadInput(_) => ExitCode::from(2),
         }
     }
-}
 
-impl Failure {
     /// The line without what kind of failure it is.
     pub(super) fn reason(self) -> String {
         match self {
@@ -43,7 +43,6 @@ impl fmt::Display for Failure {
 /// The libraries' errors are about what they were given, and name it.
 impl<E: std::error::Error> From<E> for Failure {
     fn from(error: E) -> Self {
-        let message = error.to_string();
-        Self::BadInput(message.split_whitespace().collect::<Vec<_>>().join(" "))
+        Self::BadInput(one_line(&error.to_string()))
     }
 }

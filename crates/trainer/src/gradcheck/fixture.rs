@@ -174,6 +174,8 @@ impl Reader<'_> {
         };
 
         let (project, rasterize) = self.metadata.settings()?;
+        let scene_inputs = inputs("")?;
+        self.check_ranges(&scene_inputs)?;
         let scene = Scene {
             source: self.file.to_path_buf(),
             cameras: front.first().copied().unwrap_or(1),
@@ -183,7 +185,7 @@ impl Reader<'_> {
             antialias: self.metadata.flag("antialias")?,
             project,
             rasterize,
-            inputs: inputs("")?,
+            inputs: scene_inputs,
             upstream,
         };
         Ok(Fixture {
@@ -193,6 +195,31 @@ impl Reader<'_> {
             expected,
             gradients: inputs("grad.")?,
         })
+    }
+
+    /// Refuses what is no Gaussian and no camera: reference and ours would not mean the same by it.
+    fn check_ranges(&self, inputs: &Inputs) -> Result<(), GradcheckError> {
+        let opacities = (&inputs.opacities, 0.0..=1.0);
+        let scales = (&inputs.scales, 0.0..=f64::INFINITY);
+        for (name, (array, range)) in [("opacities", opacities), ("scales", scales)] {
+            if let Some(at) = array.values.iter().position(|value| !range.contains(value)) {
+                let (value, index) = (array.values[at], index_of(at, &array.shape));
+                let (least, most) = range.into_inner();
+                let reason = format!("value {value} at {index:?} is not from {least} to {most}");
+                return Err(self.tensor(name, reason));
+            }
+        }
+        let last_rows = inputs.viewmat.values.chunks_exact(16).map(|m| &m[12..]);
+        match last_rows
+            .enumerate()
+            .find(|(_, row)| *row != [0.0, 0.0, 0.0, 1.0])
+        {
+            None => Ok(()),
+            Some((camera, row)) => {
+                let reason = format!("the last row of camera {camera} is {row:?}, not 0 0 0 1");
+                Err(self.tensor("viewmat", reason))
+            }
+        }
     }
 
     /// Refuses tensors that nothing would check.

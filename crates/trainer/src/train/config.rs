@@ -7,7 +7,7 @@ use splat_model::density::AdaptiveSettings;
 use splat_model::ops::{AdamRows, ClampGradient, RasterizeSettings};
 use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale};
 
-use crate::text::utf8;
+use crate::text::{one_line, utf8};
 
 /// What has more bytes is no file of settings, and reading it as one could take all memory.
 const LONGEST: usize = 1 << 20;
@@ -240,11 +240,6 @@ impl TrainConfig {
             )
         })
     }
-}
-
-/// Libraries' messages span lines; ours do not.
-fn one_line(message: &str) -> String {
-    message.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 /// Collects what differs between two tables, of tables in them too.

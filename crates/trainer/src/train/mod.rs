@@ -37,7 +37,6 @@ use fingerprint::Fingerprint;
 pub use checkpoint::expected_checksum;
 pub use checkpoint::{Checkpoint, CheckpointError};
 pub use config::TrainConfig;
-
 pub use history::{History, LossRecord};
 pub use loss::{IntoLoss, LossTerms, TargetView};
 pub use views::{camera, photo};
@@ -1023,6 +1022,27 @@ mod tests {
             matches!(error, TrainError::NotFinite { in_a_row: 100, .. }),
             "{error}"
         );
+    }
+
+    #[test]
+    fn a_step_that_fails_leaves_what_was_done_before_it() {
+        let fails = |view: &TargetView, rendered: &splat_model::ops::Rendered| match view.step {
+            7 => Err(OpError::Argument {
+                op: "loss",
+                what: "no more".into(),
+            }),
+            _ => Ok((rendered.image() - view.image()).abs().mean()),
+        };
+        let kept = Rc::new(RefCell::new(Vec::new()));
+        let keep = kept.clone();
+        let run = builder().loss(fails);
+        let run = run.autosave(Duration::from_secs(3600), move |checkpoint| {
+            keep.borrow_mut().push(checkpoint.step());
+            Ok(())
+        });
+        let error = run.build().unwrap().run().unwrap_err();
+        assert!(matches!(error, TrainError::Op(_)), "{error}");
+        assert_eq!(*kept.borrow(), [7]);
     }
 
     /// A photo whose loss is NaN, whose gradients are too, is passed over; nothing of it stays in the scene or in
