@@ -68,7 +68,10 @@ pub(super) fn read(
         }
     }
     if let Some(line) = repetition(&text) {
-        return Err(bad(format!("`{line}` repeats a name of the header")));
+        return Err(SceneFileError::Header {
+            path: path.to_path_buf(),
+            reason: format!("`{line}` repeats a name of the header"),
+        });
     }
     let header = parser.read_header(&mut Reader::new(text.as_bytes()));
     header.map_err(|error| {
