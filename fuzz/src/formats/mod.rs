@@ -56,7 +56,7 @@ pub struct Memory {
 /// | reader | bytes for each of the file | and |
 /// |---|---|---|
 /// | COLMAP, binary or text | 16 | 8 KiB |
-/// | PLY | 32 | 8 KiB |
+/// | PLY | 32 | 520 KiB, of which 512 are what the PLY library makes room for before it reads a list |
 /// | gradient fixture | 16 | 8 KiB |
 /// | checkpoint | 32 | 8 KiB |
 /// | settings (TOML), which are at most 1 MiB | 1,024 | 8 KiB |

@@ -9,7 +9,7 @@ use splat_model::files::{SplatData, ply};
 use splat_model::{Gaussians, RenderSettings, render};
 use splat_trainer::train::camera;
 
-use super::{Follow, Input, Target, capture, per_byte};
+use super::{Follow, Input, Memory, Target, capture};
 use crate::mutate;
 
 pub(super) const TARGET: Target = Target {
@@ -19,7 +19,11 @@ pub(super) const TARGET: Target = Target {
     mutate,
     parse,
     follow_every: 64,
-    memory: per_byte(32),
+    // The PLY library makes room for up to 65,536 entries of a list, 8 bytes each, before it finds that the file ends.
+    memory: Memory {
+        per_byte: 32,
+        constant: 8 * 65_536 + (8 << 10),
+    },
 };
 
 const WORDS: [&str; 22] = [
