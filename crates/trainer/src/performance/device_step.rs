@@ -76,16 +76,17 @@ pub struct DeviceStepRow {
     pub memory: DeviceMemory,
 }
 
-/// Whether a device is none of its own, but a program on the host.
+/// Whether a device is no hardware of its own but a program on the host.
+#[cfg(any(feature = "wgpu", feature = "cuda"))]
 fn is_software(device: &Device) -> bool {
-    #[cfg(feature = "wgpu")]
-    let is_physical = device
-        .identity()
-        .is_some_and(|known| known.physical.is_some());
-    // There is none without the feature that reaches it.
-    #[cfg(not(feature = "wgpu"))]
-    let is_physical = matches!(device, _ if false);
-    !is_physical
+    let identity = device.identity();
+    identity.is_none_or(|known| known.physical.is_none())
+}
+
+/// Without a feature that reaches other devices there is the host alone.
+#[cfg(not(any(feature = "wgpu", feature = "cuda")))]
+fn is_software(_: &Device) -> bool {
+    true
 }
 
 /// Measures steps of `capture` on `device` at degree 0, with which training begins, and 3, with which it ends. `seconds`
