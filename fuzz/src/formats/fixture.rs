@@ -7,6 +7,7 @@ use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use safetensors::Dtype;
 use serde_json::json;
+use splat_trainer::fuzzing::FIXTURE_KEYS as KEYS;
 use splat_trainer::gradcheck::{Fixture, Precision, check};
 
 use super::{Follow, Input, Target, per_byte, safetensors as file};
@@ -21,23 +22,6 @@ pub(super) const TARGET: Target = Target {
     follow_every: 32,
     memory: per_byte(16),
 };
-
-const KEYS: [&str; 14] = [
-    "width",
-    "height",
-    "sh_degree",
-    "antialias",
-    "eps2d",
-    "near",
-    "far",
-    "alpha_min",
-    "alpha_max",
-    "transmittance_min",
-    "camera_model",
-    "hard",
-    "case",
-    "seed",
-];
 
 const VALUES: [&str; 9] = [
     "0",

@@ -9,6 +9,7 @@ use std::path::Path;
 use safetensors::{Dtype, SafeTensors};
 use splat_ops::{ImageSize, sh_coefficient_count};
 
+pub use self::metadata::KEYS;
 use self::metadata::Metadata;
 use self::unique::Unique;
 use super::GradcheckError;

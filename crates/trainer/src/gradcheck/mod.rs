@@ -25,6 +25,8 @@ use burn::tensor::{DType, Device};
 use splat_ops::OpError;
 
 pub use fixture::Fixture;
+#[doc(hidden)]
+pub use fixture::KEYS as FIXTURE_KEYS;
 #[cfg(feature = "cpu")]
 pub(crate) use judge::relative_l2;
 pub use judge::{FileReport, GroupReport, OutputReport, compare, gate};
