@@ -1,8 +1,7 @@
 //! Swaps the loss: Charbonnier plus the edges' differences instead of L1 + D-SSIM. To run it:
 //! `cargo run --release --example swap_loss [CAPTURE [STEPS]]`
 
-use burn::tensor::{Device, Tensor};
-use burn_splat::train::{Capture, CaptureOptions, LossTerms, TrainConfig, Trainer, evaluate};
+use burn_splat::prelude::*;
 
 /// `mean sqrt(difference^2 + eps^2)`: L1 with a round bottom.
 fn charbonnier(difference: Tensor<4>) -> Tensor<1> {

@@ -11,9 +11,7 @@ mod adapter;
 use std::path::PathBuf;
 
 use burn::tensor::Device;
-use splat_trainer::gradcheck::{
-    Bug, FileReport, Fixture, Precision, check, check_file, run, table,
-};
+use splat_lab::gradcheck::{Bug, FileReport, Fixture, Precision, check, check_file, run, table};
 
 /// All fixtures, in the order of their names.
 fn fixtures() -> Vec<PathBuf> {

@@ -7,7 +7,7 @@ mod adapter;
 #[cfg(feature = "wgpu")]
 use adapter::adapter;
 use burn::tensor::Device;
-use splat_trainer::accuracy::{Case, cases};
+use splat_lab::accuracy::{Case, cases};
 
 fn case(number: u8) -> Case {
     let cases = cases();
@@ -97,7 +97,7 @@ hard_cases! {
 
 /// Needles up to 10,000 : 1: determinant to 1e-3, exponent to 1e-2, and nothing visible is culled.
 fn check_projection(backend: &str, device: &Device) {
-    let errors = splat_trainer::accuracy::projection::projection_errors(1_000_000, 1, device)
+    let errors = splat_lab::accuracy::projection::projection_errors(1_000_000, 1, device)
         .unwrap_or_else(|error| panic!("{backend}: {error}"));
     println!("{backend}: {errors:?}");
     assert!(errors.visible > 500_000, "{errors:?}");

@@ -7,9 +7,10 @@ mod adapter;
 
 use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
-use burn_splat::model::files::SplatData;
+use burn_splat::data::SplatData;
 use burn_splat::model::{
-    Camera, Gaussians, LearningRates, RenderSettings, SceneScale, render, splat_optimizer,
+    Camera, CameraTensors, Gaussians, LearningRates, RenderSettings, SceneScale, render,
+    splat_optimizer,
 };
 use burn_splat::ops::{AdamRows, ImageSize};
 
@@ -53,7 +54,7 @@ fn cameras(device: &Device) -> burn_splat::model::CameraTensors {
         intrinsics: [40.0, 40.0, 18.0, 14.0],
         size: SIZE,
     };
-    camera.tensors(device)
+    CameraTensors::from_camera(&camera, device)
 }
 
 fn image(scene: &SplatData, device: &Device) -> Vec<f32> {

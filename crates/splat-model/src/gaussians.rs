@@ -8,7 +8,7 @@ use splat_ops::{
     sigmoid,
 };
 
-use crate::files::{SceneSettings, SplatData};
+use splat_data::{SceneSettings, SplatData};
 
 /// N Gaussians. Parameters are stored before their activation, as in 3DGS: scales as logarithms,
 /// opacities as logits.

@@ -5,13 +5,10 @@ use std::collections::HashMap;
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
 use serde::{Deserialize, Serialize};
-use splat_ops::sh_coefficient_count;
+use splat_core::{SH_C0, sh_coefficient_count};
 
-use crate::SceneScale;
-use crate::files::SplatData;
-
-/// Value of the constant spherical harmonic, 1 / (2 sqrt(pi)).
-const SH_C0: f64 = 0.282_094_791_773_878_14;
+use splat_data::SceneScale;
+use splat_data::SplatData;
 
 /// Level of 8 bits at which a channel starts that is 0 in the photos.
 const DARKEST_LEVEL: f64 = 0.5;

@@ -7,8 +7,8 @@ use burn::optim::lr_scheduler::module_lr_scheduler::{ModuleLearningRate, ModuleL
 use serde::{Deserialize, Serialize};
 use splat_ops::AdamRows;
 
-use crate::SceneScale;
 use crate::adam::{EditLog, SplatAdam};
+use splat_data::SceneScale;
 
 /// The fields of [`Gaussians`](crate::Gaussians), by the names they have there.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

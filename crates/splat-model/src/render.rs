@@ -1,6 +1,7 @@
 //! The three ops composed: Gaussians and a camera to an image.
 
 use burn::tensor::Tensor;
+use splat_data::SplatData;
 use splat_ops::{
     ClampGradient, OpError, ProjectSettings, Projected, RasterizeSettings, Rendered,
     ShColorSettings, project, rasterize,
@@ -23,6 +24,22 @@ pub struct RenderSettings {
     pub project: ProjectSettings,
     /// Settings of the rasteriser.
     pub rasterize: RasterizeSettings,
+}
+
+impl RenderSettings {
+    /// How to render a scene as it was trained, as far as its file says, up to its degree of spherical harmonics: without
+    /// anti-aliasing and in front of black where it does not.
+    pub fn of_scene(scene: &SplatData) -> Self {
+        let settings = &scene.settings;
+        Self {
+            sh_degree: scene.sh_degree,
+            project: scene.scene_scale().project_settings(),
+            antialias: settings.antialias.unwrap_or_default(),
+            // Black is what costs nothing.
+            background: settings.background.filter(|color| *color != [0.0; 3]),
+            ..Self::default()
+        }
+    }
 }
 
 /// Renders Gaussians in C cameras: the image `[C, H, W, 3]` and alpha `[C, H, W, 1]`.

@@ -17,12 +17,7 @@ use crate::composed;
 use crate::settings::{ProjectArgs, RasterizeArgs, ShColorSettings};
 use crate::ssim::SsimArgs;
 
-/// Floats per splat in the packed output of `project`:
-/// `[mean_x, mean_y, depth, w11, w21, w22, compensation, extent_x, extent_y]`.
-pub const PROJECTED_WIDTH: usize = 9;
-
-/// Which of them is `extent_x`: above zero exactly where the splat was not culled.
-pub const PROJECTED_EXTENT: usize = 7;
+pub use splat_core::{PROJECTED_EXTENT, PROJECTED_WIDTH};
 
 /// The forward and backward computations of one backend. Callers have checked all shapes; tensors
 /// need not be contiguous. `wanted` says which gradients are needed, in the order of the inputs;

@@ -5,9 +5,9 @@ use burn::tensor::{Device, Tensor};
 
 use crate::OpError;
 use crate::check::is_flex;
-pub use crate::memory::available_memory;
 #[cfg(feature = "cpu")]
 use crate::{Projected, RasterizeSettings, RasterizeWork};
+pub use splat_core::memory::available_memory;
 
 /// What the kernels did since the process began, over all devices; a piece of work is a difference of two.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

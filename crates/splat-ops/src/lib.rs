@@ -34,7 +34,6 @@ pub mod cpu;
 mod cube;
 pub mod device;
 mod error;
-mod memory;
 mod photometric;
 mod project;
 mod rasterize;

@@ -3,17 +3,11 @@
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 
+pub use splat_core::{SH_DEGREE_MAX, sh_coefficient_count};
+
 use crate::OpError;
 use crate::backend::SplatOps;
 use crate::check::Checker;
-
-/// Highest degree of spherical harmonics.
-pub const SH_DEGREE_MAX: usize = 3;
-
-/// Number of basis functions up to a degree: `(degree + 1)^2`.
-pub const fn sh_coefficient_count(degree: usize) -> usize {
-    (degree + 1) * (degree + 1)
-}
 
 /// Evaluates real spherical harmonics in C x N directions.
 ///

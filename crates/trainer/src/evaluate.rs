@@ -2,13 +2,13 @@
 
 use burn::tensor::{Device, Tensor};
 use serde::Serialize;
+use splat_data::View;
 use splat_model::losses::{SsimSettings, psnr, ssim};
 use splat_model::ops::OpError;
 use splat_model::ops::device::to_host;
-use splat_model::{Gaussians, RenderSettings, render};
+use splat_model::{CameraTensors, Gaussians, RenderSettings, render};
 
-use crate::capture::View;
-use crate::train::{camera, photo};
+use crate::photo::photo;
 
 /// Scores of one view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -46,8 +46,12 @@ pub fn evaluate(
 ) -> Result<Scores, OpError> {
     let mut scores = Vec::with_capacity(views.len());
     for view in views {
-        let camera = camera(view).relative_to(gaussians.origin);
-        let rendered = render(gaussians, &camera.tensors(device), settings)?;
+        let camera = view.camera().relative_to(gaussians.origin);
+        let rendered = render(
+            gaussians,
+            &CameraTensors::from_camera(&camera, device),
+            settings,
+        )?;
         let image = rendered.image().clamp(0.0, 1.0);
         let target = photo(view, device);
         let scalar = |value: Tensor<1>| -> Result<f64, OpError> {

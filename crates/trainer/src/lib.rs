@@ -1,19 +1,9 @@
-//! Captures, the training loop, evaluation, reports, and the `splat` program.
+//! The training loop, checkpoints and evaluation.
 
-#[cfg(feature = "cpu")]
-pub mod accuracy;
-pub mod capture;
-pub mod cli;
 mod evaluate;
-#[doc(hidden)]
-pub mod fuzzing;
-pub mod gradcheck;
-#[cfg(feature = "cpu")]
-pub mod performance;
-pub mod report;
-mod text;
+mod photo;
 pub mod train;
 
-pub use capture::{Capture, CaptureOptions};
 pub use evaluate::{Scores, ViewScore, evaluate};
+pub use photo::photo;
 pub use train::{LossTerms, TargetView, TrainConfig, TrainError, Trained, Trainer, Warning};

@@ -9,8 +9,8 @@ use std::sync::{Arc, OnceLock};
 use burn::tensor::Device;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use splat_trainer::train::camera;
-use splat_trainer::{Capture, CaptureOptions, TrainConfig, Trained, Trainer, Warning};
+use splat_data::{Capture, CaptureOptions};
+use splat_trainer::{TrainConfig, Trained, Trainer, Warning};
 
 /// The training view that some of the tests spoil.
 const SPOILED: usize = 5;
@@ -175,7 +175,7 @@ fn a_camera_inside_the_points_is_named() {
 fn a_camera_far_away_is_named() {
     let mut capture = capture();
     let view = &capture.views[capture.split.train[SPOILED]];
-    let place = camera(view).position() * 100.0;
+    let place = view.camera().position() * 100.0;
     let names = spoil_camera(&mut capture, |viewmat| moved(viewmat, place.to_array()));
     let warnings = train("camera far away", capture, config());
     let found = |w: &Warning| matches!(w, Warning::CamerasFarAway { views, .. } if *views == names);

@@ -5,9 +5,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor};
-use splat_model::{SceneScale, render};
-use splat_trainer::train::camera;
-use splat_trainer::{Capture, CaptureOptions, TrainConfig, Trainer, evaluate};
+use splat_data::{Capture, CaptureOptions, View};
+use splat_model::{CameraTensors, SceneScale, render};
+use splat_trainer::{TrainConfig, Trainer, evaluate};
 
 /// From a micrometre to a thousand kilometres, and two that are no powers of ten.
 const UNITS: [f64; 6] = [1e-6, 0.002, 0.37, 25.4, 1e3, 1e6];
@@ -63,8 +63,8 @@ fn first_step(unit: f64) -> Vec<(&'static str, Vec<f32>, i32)> {
     let trainer = trainer(&capture, 0);
     let gaussians = trainer.gaussians();
     let settings = TrainConfig::default().render_settings(0, trainer.scene_scale());
-    let camera = camera(&capture.views[3]).relative_to(gaussians.origin);
-    let camera = camera.tensors(&gaussians.means.device());
+    let camera = capture.views[3].camera().relative_to(gaussians.origin);
+    let camera = CameraTensors::from_camera(&camera, &gaussians.means.device());
     let image = render(gaussians, &camera, &settings).unwrap().image();
     let grads = (image.clone() - 0.4).square().mean().backward();
     let scales: Vec<f32> = host(gaussians.log_scales.val().exp());
@@ -135,7 +135,7 @@ fn training_is_the_same_in_any_unit() {
 fn one_camera_far_out_does_not_change_the_scale() {
     let mut capture = (*capture(1.0)).clone();
     let scale = |capture: &Capture| {
-        let cameras: Vec<_> = capture.views.iter().map(camera).collect();
+        let cameras: Vec<_> = capture.views.iter().map(View::camera).collect();
         let points: Vec<_> = capture.points.iter().map(|point| point.position).collect();
         SceneScale::of_capture(&cameras, &points).length()
     };

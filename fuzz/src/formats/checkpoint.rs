@@ -10,8 +10,8 @@ use burn_pack::{Bytes, DType, Reader, Scalar, Tensor, Writer};
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use serde_json::{Value, json};
-use splat_trainer::fuzzing::expected_checksum;
 use splat_trainer::train::Checkpoint;
+use splat_trainer::train::expected_checksum;
 use splat_trainer::{TrainConfig, Trainer};
 
 use super::{

@@ -5,8 +5,8 @@ use std::sync::Arc;
 
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
+use splat_data::capture::in_memory::parse as parse_capture;
 use splat_trainer::TrainConfig;
-use splat_trainer::fuzzing::parse_capture;
 
 use super::colmap::Model;
 use super::{Follow, Input, Target, per_byte, train_steps};

@@ -7,8 +7,8 @@ use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use safetensors::Dtype;
 use serde_json::json;
-use splat_trainer::fuzzing::FIXTURE_KEYS as KEYS;
-use splat_trainer::gradcheck::{Fixture, Precision, check};
+use splat_lab::gradcheck::FIXTURE_KEYS as KEYS;
+use splat_lab::gradcheck::{Fixture, Precision, check};
 
 use super::{Follow, Input, Target, per_byte, safetensors as file};
 use crate::mutate::{WORDS, number, one_of, real};

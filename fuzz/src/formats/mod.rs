@@ -13,8 +13,9 @@ use std::sync::{Arc, LazyLock};
 
 use burn::tensor::Device;
 use rand_pcg::Pcg64Mcg;
+use splat_data::Capture;
 use splat_trainer::train::Checkpoint;
-use splat_trainer::{Capture, TrainConfig, Trainer};
+use splat_trainer::{TrainConfig, Trainer};
 
 /// What is run: the content of one file, or of several that belong together.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -82,7 +83,7 @@ fn capture() -> Arc<Capture> {
     static CAPTURE: LazyLock<Arc<Capture>> = LazyLock::new(|| {
         let files = colmap::Model::small().binary();
         let [cameras, images, points] = [0, 1, 2].map(|part| files.0[part].as_slice());
-        let capture = splat_trainer::fuzzing::parse_capture(true, [cameras, images, points]);
+        let capture = splat_data::capture::in_memory::parse(true, [cameras, images, points]);
         Arc::new(capture.expect("the seed is a valid model"))
     });
     CAPTURE.clone()

@@ -5,9 +5,9 @@ use std::path::Path;
 use burn::tensor::Device;
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
-use splat_model::files::{SplatData, ply};
-use splat_model::{Gaussians, RenderSettings, render};
-use splat_trainer::train::camera;
+use splat_data::SplatData;
+use splat_data::scene::ply;
+use splat_model::{CameraTensors, Gaussians, RenderSettings, render};
 
 use super::{Follow, Input, Memory, Target, capture};
 use crate::mutate;
@@ -153,7 +153,8 @@ fn parse(input: &Input) -> Result<Follow, String> {
         let device = Device::flex();
         let gaussians = Gaussians::from_data(&scene, &device);
         let view = &capture().views[0];
-        let cameras = camera(view).relative_to(gaussians.origin).tensors(&device);
+        let cameras =
+            CameraTensors::from_camera(&view.camera().relative_to(gaussians.origin), &device);
         let settings = RenderSettings {
             sh_degree: scene.sh_degree,
             ..RenderSettings::default()

@@ -10,9 +10,11 @@ use splat_ops::{OpError, Projected, ScreenStatistics};
 
 use super::edit::{RowPlan, apply_plan, clamp_opacities};
 use crate::adam::EditLog;
-use crate::files::SplatData;
 use crate::gaussians::host;
-use crate::{Gaussians, SceneScale};
+use splat_data::SceneScale;
+use splat_data::SplatData;
+
+use crate::Gaussians;
 
 /// The run length that the milestones below are stated for.
 const REFERENCE_STEPS: f64 = 30_000.0;

@@ -17,9 +17,9 @@ use super::rasterize::{MOMENTS, Splat, kept_per_pair};
 use super::real::Real;
 use crate::OpError;
 use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH};
-use crate::memory::{in_units, lacking};
 use crate::settings::RasterizeArgs;
 use emit::{Emission, Emitted, emit};
+use splat_core::memory::{in_units, lacking};
 
 /// Side of a tile in pixels.
 pub(super) const TILE: usize = 16;

@@ -17,7 +17,7 @@ use serde::{Deserialize, Serialize};
 use splat_model::Gaussians;
 
 use super::{History, State};
-use crate::report::write_durably;
+use splat_data::write_durably;
 
 pub(super) use run::RunRecord;
 

@@ -5,7 +5,7 @@ use std::collections::HashMap;
 use splat_model::density::RunShape;
 
 use super::TrainConfig;
-use crate::capture::{Capture, View};
+use splat_data::{Capture, View};
 
 /// By what photos are divided at a step.
 pub(super) fn factor(config: &TrainConfig, run: RunShape, step: usize) -> u32 {
@@ -44,7 +44,7 @@ mod tests {
     use super::*;
     use splat_model::SceneScale;
 
-    use crate::capture::CaptureOptions;
+    use splat_data::CaptureOptions;
 
     #[test]
     fn resolution_doubles_at_every_milestone() {

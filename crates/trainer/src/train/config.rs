@@ -7,7 +7,7 @@ use splat_model::density::AdaptiveSettings;
 use splat_model::ops::{AdamRows, ClampGradient, RasterizeSettings};
 use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale};
 
-use crate::text::{one_line, utf8};
+use splat_data::text::{one_line, utf8};
 
 /// What has more bytes is no file of settings, and reading it as one could take all memory.
 const LONGEST: usize = 1 << 20;

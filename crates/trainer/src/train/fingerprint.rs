@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use crate::capture::{Capture, View};
+use splat_data::{Capture, View};
 
 /// What tells one capture from another: of each view name, size, camera, use and photo; the number of points.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -170,7 +170,7 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::capture::{CaptureOptions, Split};
+    use splat_data::{CaptureOptions, Split};
 
     fn capture() -> Capture {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");

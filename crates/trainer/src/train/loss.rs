@@ -7,7 +7,7 @@ use splat_model::CameraTensors;
 use splat_model::losses::SsimSettings;
 use splat_model::ops::{OpError, Rendered, photometric};
 
-use super::views::values;
+use crate::photo::values;
 
 /// A training view as a loss sees it.
 #[derive(Debug)]

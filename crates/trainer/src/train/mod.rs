@@ -18,20 +18,21 @@ use std::time::{Duration, Instant};
 use burn::module::Module;
 use burn::optim::{GradientsParams, ModuleOptimizer};
 use burn::tensor::{Device, Tensor, Transaction};
+use splat_data::{SceneSettings, SplatData};
 use splat_model::density::{AdaptiveDensity, RunShape};
-use splat_model::files::{SceneSettings, SplatData};
 use splat_model::ops::device::keep_awake;
 use splat_model::ops::{OpError, SH_DEGREE_MAX};
 use splat_model::{
-    EditLog, Gaussians, InitError, RenderSettings, SceneScale, project_gaussians, render_projected,
-    splat_optimizer, splats_from_points,
+    CameraTensors, EditLog, Gaussians, InitError, RenderSettings, SceneScale, project_gaussians,
+    render_projected, splat_optimizer, splats_from_points,
 };
 use tracing::trace_span;
 
-use crate::capture::{Capture, CaptureError, View};
 use crate::evaluate::evaluate;
+use crate::photo::levels;
 use checkpoint::RunRecord;
 use fingerprint::Fingerprint;
+use splat_data::{Capture, CaptureError, View};
 
 #[doc(hidden)]
 pub use checkpoint::expected_checksum;
@@ -39,7 +40,6 @@ pub use checkpoint::{Checkpoint, CheckpointError};
 pub use config::TrainConfig;
 pub use history::{History, LossRecord};
 pub use loss::{IntoLoss, LossTerms, TargetView};
-pub use views::{camera, photo};
 pub use warnings::Warning;
 
 /// Why a run could not go on.
@@ -275,7 +275,7 @@ impl TrainerBuilder {
         let loss = self
             .loss
             .unwrap_or_else(|| LossTerms::l1_ssim(self.config.ssim_weight));
-        let cameras: Vec<_> = capture.views.iter().map(camera).collect();
+        let cameras: Vec<_> = capture.views.iter().map(View::camera).collect();
         let points: Vec<[f64; 3]> = capture.points.iter().map(|point| point.position).collect();
         let run = RunShape {
             steps: self.config.steps,
@@ -588,9 +588,10 @@ impl Trainer {
         let index = self.capture.split.train[self.views.at(step)];
         let factor = coarse::factor(&self.config, self.run, step);
         let view = self.coarse.view(&self.capture, index, factor);
-        let cameras = camera(&view)
-            .relative_to(self.gaussians.origin)
-            .tensors(&self.device);
+        let cameras = CameraTensors::from_camera(
+            &view.camera().relative_to(self.gaussians.origin),
+            &self.device,
+        );
         let settings = self
             .config
             .render_settings(self.sh_degree(step), self.run.scene_scale);
@@ -604,7 +605,7 @@ impl Trainer {
         }
         let rendered = render_projected(&self.gaussians, &projected, &cameras, &settings)?;
         drop(render);
-        let levels = trace_span!("photo").in_scope(|| views::levels(&view, &self.device));
+        let levels = trace_span!("photo").in_scope(|| levels(&view, &self.device));
         let target = TargetView::new(&view.name, levels, &cameras, step);
         let evaluated = trace_span!("loss").in_scope(|| self.loss.evaluate(&target, &rendered))?;
         let Some((loss, terms)) = evaluated else {
@@ -764,7 +765,7 @@ mod tests {
     use std::rc::Rc;
 
     use super::*;
-    use crate::capture::CaptureOptions;
+    use splat_data::CaptureOptions;
 
     fn capture() -> Arc<Capture> {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");

@@ -1,47 +1,8 @@
-//! The order in which views are trained on, and their way to the device.
+//! The order in which views are trained on.
 
-use burn::tensor::{DType, Device, Int, Tensor, TensorData};
-use glam::{DMat4, DVec4};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_pcg::Pcg64Mcg;
-use splat_model::Camera;
-use splat_model::ops::ImageSize;
-
-use crate::capture::View;
-
-/// The camera of a view.
-pub fn camera(view: &View) -> Camera {
-    let [r0, r1, r2, r3] = view.viewmat.map(DVec4::from_array);
-    Camera {
-        viewmat: DMat4::from_cols(r0, r1, r2, r3).transpose(),
-        intrinsics: view.intrinsics,
-        size: ImageSize {
-            width: view.width,
-            height: view.height,
-        },
-    }
-}
-
-/// The photo of a view, `[1, H, W, 3]` in [0, 1].
-pub fn photo(view: &View, device: &Device) -> Tensor<4> {
-    values(levels(view, device))
-}
-
-/// The photo of a view as it is stored, 8-bit levels `[1, H, W, 3]`: of type U8 where the device can compute with it.
-pub(super) fn levels(view: &View, device: &Device) -> Tensor<4, Int> {
-    let dtype = match device.supports_dtype(DType::U8) {
-        true => DType::U8,
-        false => DType::I32,
-    };
-    let shape = [1, view.height as usize, view.width as usize, 3];
-    Tensor::from_data(TensorData::new(view.image.to_vec(), shape), (device, dtype))
-}
-
-/// Levels from 0 to 255 as values in [0, 1].
-pub(super) fn values(levels: Tensor<4, Int>) -> Tensor<4> {
-    levels.float() / 255.0
-}
 
 /// Which of `count` views step `step` trains on: every epoch is a permutation drawn from (seed,
 /// epoch) alone, so a resumed run goes on as it would have.

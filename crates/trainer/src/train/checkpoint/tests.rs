@@ -7,8 +7,8 @@ use burn::tensor::Device;
 use burn_pack::{Reader, Scalar, Tensor, Writer};
 
 use super::*;
-use crate::capture::{Capture, CaptureOptions};
 use crate::train::{TrainConfig, Trainer};
+use splat_data::{Capture, CaptureOptions};
 
 fn capture() -> Arc<Capture> {
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");

@@ -7,8 +7,8 @@ use rayon::prelude::*;
 use splat_model::Gaussians;
 
 use super::{Warning, median, quantile};
-use crate::capture::{Capture, View};
-use crate::train::{TrainConfig, camera};
+use crate::train::TrainConfig;
+use splat_data::{Capture, View};
 
 /// Points that share a place are a warning from this share of all on: matches found twice are a few percent.
 const COINCIDENT: f64 = 0.5;
@@ -76,7 +76,7 @@ struct Outlook {
 
 impl Outlook {
     fn of(view: &View, positions: &[DVec3]) -> Self {
-        let center = camera(view).position();
+        let center = view.camera().position();
         let distances: Vec<f64> = positions.iter().map(|p| p.distance(center)).collect();
         let seen = |position: &&DVec3| {
             let ([x, y], depth) = view.project(position.to_array());

@@ -1,0 +1,54 @@
+//! What a bench of speed measures on: a capture.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use clap::Args;
+
+use super::{Failure, GlobalArgs};
+use crate::photos::PhotoArgs;
+use splat_data::Capture;
+use splat_trainer::train::TrainConfig;
+
+/// The capture that the project carries.
+pub(super) const EXAMPLE: &str = "examples/data/saharov";
+
+/// The capture, and how long to measure.
+#[derive(Debug, Clone, Args)]
+pub(super) struct CaptureArgs {
+    #[command(flatten)]
+    pub(super) photos: PhotoArgs,
+    /// Measure each setting for about so long; once through it in any case
+    #[arg(long, value_name = "S", default_value_t = 10.0)]
+    pub(super) seconds: f64,
+}
+
+impl CaptureArgs {
+    /// Reads a capture, by default the project's example.
+    pub(super) fn open(
+        &self,
+        folder: Option<&Path>,
+        global: &GlobalArgs,
+    ) -> Result<Arc<Capture>, Failure> {
+        let folder = folder.map_or_else(|| PathBuf::from(EXAMPLE), Path::to_owned);
+        let capture = self.photos.open(&folder, global)?;
+        capture.check_trainable()?;
+        Ok(Arc::new(capture))
+    }
+
+    /// The usual settings, but for what was asked for.
+    pub(super) fn config(&self, global: &GlobalArgs) -> TrainConfig {
+        TrainConfig {
+            downscale: self.photos.options().downscale,
+            seed: global.seed.unwrap_or_default(),
+            ..TrainConfig::default()
+        }
+    }
+
+    /// As they are typed, with a space before each.
+    pub(super) fn typed(&self) -> String {
+        let words = self.photos.words();
+        let words = words.iter().map(|word| format!(" {}", word.display()));
+        words.collect()
+    }
+}

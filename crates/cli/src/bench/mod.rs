@@ -1,0 +1,98 @@
+//! `splat bench`: errors, speed and how it grows, on the CPU or a CubeCL device.
+
+mod accuracy;
+mod input;
+mod performance;
+mod rasterize;
+mod scaling;
+mod step;
+
+use std::path::{Path, PathBuf};
+
+use burn::tensor::Device;
+use clap::{Args, Subcommand};
+
+use super::{DeviceChoice, Failure, GlobalArgs, device, print};
+use splat_data::WriteError;
+
+use crate::report::{probe_file, write_atomically};
+
+/// Measure errors and speed
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  splat bench accuracy --report docs
+  splat bench step photos/ --downscale 2
+  splat bench step photos/ --downscale 2 --device wgpu
+  splat bench performance --report docs")]
+pub struct BenchArgs {
+    #[command(subcommand)]
+    bench: Bench,
+}
+
+/// What `splat bench` measures.
+#[derive(Debug, Subcommand)]
+enum Bench {
+    Accuracy(accuracy::AccuracyArgs),
+    Step(step::StepArgs),
+    Rasterize(rasterize::RasterizeArgs),
+    Scaling(scaling::ScalingArgs),
+    Capture(scaling::SyntheticArgs),
+    Performance(performance::PerformanceArgs),
+    Point(scaling::PointArgs),
+}
+
+/// Runs the command.
+pub(super) fn run(args: &BenchArgs, global: &GlobalArgs) -> Result<(), Failure> {
+    match &args.bench {
+        Bench::Accuracy(args) => accuracy::run(args, global),
+        Bench::Step(args) => step::run(args, global),
+        Bench::Rasterize(args) => rasterize::run(args, global),
+        Bench::Scaling(args) => scaling::run(args, global),
+        Bench::Capture(args) => scaling::run_synthetic(args),
+        Bench::Performance(args) => performance::run(args, global),
+        Bench::Point(args) => scaling::run_point(args, global),
+    }
+}
+
+/// Tries whether the files of a report can be written, before the long work.
+fn probe_report(folder: &Option<PathBuf>, names: &[&str]) -> Result<(), WriteError> {
+    let Some(folder) = folder else { return Ok(()) };
+    names
+        .iter()
+        .try_for_each(|name| probe_file(&folder.join(name)))
+}
+
+/// Writes a file of a report.
+fn write(folder: &Path, name: &str, text: &str) -> Result<(), WriteError> {
+    let path = folder.join(name);
+    write_atomically(&path, text.as_bytes()).map_err(|source| WriteError { path, source })
+}
+
+/// Writes a picture.
+fn write_svg(path: &Path, svg: Result<String, String>) -> Result<(), Failure> {
+    let svg = svg.map_err(Failure::Check)?;
+    let written = write_atomically(path, svg.as_bytes());
+    let path = path.to_owned();
+    Ok(written.map_err(|source| WriteError { path, source })?)
+}
+
+/// What the benches of speed measure on: the CPU unless another device is asked for by name.
+fn chosen(global: &GlobalArgs) -> Result<Device, Failure> {
+    match global.device {
+        DeviceChoice::Auto | DeviceChoice::Cpu => Ok(Device::flex()),
+        DeviceChoice::Wgpu | DeviceChoice::Vulkan | DeviceChoice::Cuda => {
+            Ok(device::open(global)?.device)
+        }
+    }
+}
+
+/// The page of all benches of speed is about the CPU: another device is not what the user would get figures for.
+fn cpu_only(global: &GlobalArgs) -> Result<(), Failure> {
+    match global.device {
+        DeviceChoice::Auto | DeviceChoice::Cpu => Ok(()),
+        DeviceChoice::Wgpu | DeviceChoice::Vulkan | DeviceChoice::Cuda => Err(Failure::BadInput(
+            "--device: this page is about the CPU; step, rasterize and scaling take a device each"
+                .to_owned(),
+        )),
+    }
+}

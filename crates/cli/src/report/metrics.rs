@@ -1,0 +1,79 @@
+//! The figures of a run: `metrics.json`.
+
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::{ReportError, write};
+use splat_trainer::Scores;
+
+/// Everything in `metrics.json`, in the order of its fields.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Metrics {
+    /// Quality on the held-out views: `psnr`, `ssim`, `views`. What does not exist (the mean over no view) or is infinite
+    /// (the PSNR of a perfect copy) is `null`.
+    #[serde(flatten)]
+    pub scores: Scores,
+    /// Number of Gaussians of the scene.
+    pub gaussians: usize,
+    /// Number of steps trained.
+    pub steps: usize,
+    /// Seconds spent training.
+    pub seconds: f64,
+    /// Seconds a step took on average.
+    pub seconds_per_step: f64,
+    /// Most memory that was resident, `null` where the system does not say ([`super::memory::peak_rss_bytes`]).
+    pub peak_rss_bytes: Option<u64>,
+    /// Memory that a CubeCL device's allocator held at the end, what it keeps for reuse included; `null` elsewhere.
+    pub device_bytes: Option<u64>,
+    /// What was computed on.
+    pub device: String,
+    /// Seed of the run.
+    pub seed: u64,
+}
+
+/// Writes `value` ([`Scores`], [`Metrics`] or anything else) as indented JSON.
+///
+/// # Errors
+///
+/// [`ReportError`], naming the file.
+pub fn write_json(path: &Path, value: &impl Serialize) -> Result<(), ReportError> {
+    let mut json = serde_json::to_string_pretty(value).map_err(|error| ReportError::Encode {
+        path: path.to_path_buf(),
+        reason: error.to_string(),
+    })?;
+    json.push('\n');
+    write(path, json.as_bytes())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use splat_trainer::ViewScore;
+
+    #[test]
+    fn the_fields_are_those_promised() {
+        let view = |name: &str, psnr, ssim| ViewScore {
+            name: name.to_owned(),
+            psnr,
+            ssim,
+        };
+        let metrics = Metrics {
+            scores: Scores::of_views(vec![view("a", 20.0, 0.5), view("b", 23.0, 0.75)]),
+            gaussians: 3,
+            steps: 10,
+            seconds: 5.0,
+            seconds_per_step: 0.5,
+            peak_rss_bytes: None,
+            device_bytes: None,
+            device: "cpu".into(),
+            seed: 7,
+        };
+        assert_eq!(
+            serde_json::to_string(&metrics).unwrap(),
+            r#"{"psnr":21.5,"ssim":0.625,"views":[{"name":"a","psnr":20.0,"ssim":0.5},{"name":"b","psnr":23.0,"ssim":0.75}],"gaussians":3,"steps":10,"seconds":5.0,"seconds_per_step":0.5,"peak_rss_bytes":null,"device_bytes":null,"device":"cpu","seed":7}"#
+        );
+        let none = serde_json::to_string(&Scores::of_views(vec![])).unwrap();
+        assert_eq!(none, r#"{"psnr":null,"ssim":null,"views":[]}"#);
+    }
+}

@@ -1,0 +1,70 @@
+//! A scene file on a device, and how to render it.
+
+use std::path::Path;
+
+use burn::tensor::Device;
+use clap::ValueEnum;
+use splat_data::SceneSettings;
+use splat_data::scene::ply;
+use splat_model::{Gaussians, RenderSettings, ShPrecision};
+
+use super::{Failure, GlobalArgs, text};
+
+/// What `--sh-precision` takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub enum PrecisionChoice {
+    /// Single precision
+    #[default]
+    Exact,
+    /// The higher degrees in half precision, on devices that read it: less memory; docs/GPU.md has the error
+    Half,
+}
+
+/// Reads a scene, and how it must be rendered: as its file says. Files of earlier versions, and of other programs, do
+/// not say whether it was trained with anti-aliasing or in front of a background; of those, and only of those, the
+/// run's `config.toml` beside the file is asked, if there is one.
+pub(super) fn open(
+    path: &Path,
+    device: &Device,
+    precision: PrecisionChoice,
+    global: &GlobalArgs,
+) -> Result<(Gaussians, RenderSettings), Failure> {
+    let mut data = ply::read(path)?;
+    for comment in &data.settings.not_understood {
+        global.say(format_args!(
+            "warning: {}: not followed: comment `{comment}`",
+            path.display()
+        ));
+    }
+    ask_config(path, &mut data.settings, global);
+    let mut gaussians = Gaussians::from_data(&data, device);
+    if precision == PrecisionChoice::Half {
+        gaussians = gaussians.with_sh_precision(ShPrecision::Half);
+        if gaussians.sh_precision() == ShPrecision::Exact {
+            global.say("rendering exactly: there are no higher degrees that fit half precision, or the device reads none");
+        }
+    }
+    Ok((gaussians, RenderSettings::of_scene(&data)))
+}
+
+/// Takes what the scene does not say from the `config.toml` beside it. One that is not a run's is passed over.
+fn ask_config(scene: &Path, settings: &mut SceneSettings, global: &GlobalArgs) {
+    let path = scene.with_file_name("config.toml");
+    let says_all = settings.antialias.is_some() && settings.background.is_some();
+    if says_all || !path.is_file() {
+        return;
+    }
+    match text::read_config(&path) {
+        Ok(config) => {
+            if config.antialias || config.background.is_some() {
+                global.say("rendering as the config.toml beside the scene says");
+            }
+            settings.antialias.get_or_insert(config.antialias);
+            let background = config.background.unwrap_or_default();
+            settings.background.get_or_insert(background);
+        }
+        Err(failure) => global.say(format_args!(
+            "warning: the config.toml beside the scene is not a run's settings and is passed over ({failure})"
+        )),
+    }
+}

@@ -1,0 +1,317 @@
+//! `splat train`: a scene from photos.
+
+mod results;
+mod resume;
+
+use std::cell::RefCell;
+use std::path::{Path, PathBuf};
+use std::rc::Rc;
+use std::sync::Arc;
+use std::time::Duration;
+
+use clap::{Args, ValueEnum};
+
+use super::command_line::CommandLine;
+use super::device::ChosenDevice;
+use super::photos::PhotoArgs;
+use super::{Failure, GlobalArgs, device, eval, interrupt, print, text};
+use crate::report::progress::Progress;
+use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
+use resume::Interrupted;
+use splat_data::{Capture, CaptureOptions};
+use splat_trainer::train::{Checkpoint, TrainConfig, Trainer, TrainerBuilder};
+
+/// The held-out views are measured this many times during a run, for the curves.
+const MEASUREMENTS: usize = 10;
+/// The loss shown is the mean over this many steps.
+const LOSS_WINDOW: usize = 50;
+/// A crash loses no more than so many seconds of training, unless `--autosave` says otherwise.
+const AUTOSAVE: u64 = 60;
+
+/// Train a scene from photos
+#[derive(Debug, Args)]
+#[command(after_help = "Examples:
+  splat train examples/data/saharov --steps 1000
+  splat train photos/ --downscale 2 --steps 7000 --out out/garden
+  splat train photos/ --images images_4
+  splat train photos/ --resume out/garden
+
+Writes to DIR: scene.ply, metrics.json, config.toml, curves.svg, losses.csv and views/*.png (truth
+beside render). Ctrl-C finishes the step, writes the scene and a checkpoint to resume from; a second
+Ctrl-C ends at once. A checkpoint is also written every minute, so that --resume goes on after a crash.
+
+--resume takes the settings of the run from its checkpoint, and refuses another capture, another seed
+and the like. --steps and --max-gaussians may be given anew: they hold from there on, schedules follow
+the new number of steps, and config.toml notes it, for the run cannot be repeated from it alone then.")]
+pub struct TrainArgs {
+    /// Capture: a folder with `images/` and `sparse/0/`
+    pub capture: PathBuf,
+    /// Folder to write to [default: out/<name of the capture>]
+    #[arg(long, value_name = "DIR")]
+    pub out: Option<PathBuf>,
+    /// Number of steps; the recipe's milestones scale with it [default: 30000]
+    #[arg(long, value_name = "N")]
+    pub steps: Option<usize>,
+    #[command(flatten)]
+    pub photos: PhotoArgs,
+    /// Highest degree of spherical harmonics, 0 to 3 [default: 3]
+    #[arg(long, value_name = "D")]
+    pub sh_degree: Option<usize>,
+    /// Density control
+    #[arg(long, value_enum, default_value_t)]
+    pub strategy: Strategy,
+    /// No growth beyond this many Gaussians [default: seven for every ten pixels of a photo, or one for every hundred
+    /// of all photos, whichever is more]
+    #[arg(long, value_name = "N")]
+    pub max_gaussians: Option<usize>,
+    /// Settings, such as the config.toml of another run; arguments win over it
+    #[arg(long, value_name = "FILE")]
+    pub config: Option<PathBuf>,
+    /// Go on with the interrupted run in this folder
+    #[arg(long, value_name = "DIR", conflicts_with = "config")]
+    pub resume: Option<PathBuf>,
+    /// Seconds of training between checkpoints
+    #[arg(long, value_name = "S", default_value_t = AUTOSAVE)]
+    pub autosave: u64,
+}
+
+/// What `--strategy` takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+pub enum Strategy {
+    /// Adaptive density control of 3DGS: clone, split, prune, reset opacities
+    #[default]
+    Adc,
+}
+
+impl TrainArgs {
+    /// The run's settings: the file's (or the interrupted run's, or the defaults), then the arguments'.
+    fn config(
+        &self,
+        resumed: Option<&Interrupted>,
+        global: &GlobalArgs,
+    ) -> Result<TrainConfig, Failure> {
+        let mut config = match (resumed, &self.config) {
+            (Some(run), _) => run.checkpoint.config().clone(),
+            (None, Some(path)) => text::read_config(path)?,
+            (None, None) => TrainConfig::default(),
+        };
+        let Strategy::Adc = self.strategy;
+        config.steps = self.steps.unwrap_or(config.steps);
+        config.downscale = self.photos.downscale.unwrap_or(config.downscale);
+        config.seed = global.seed.unwrap_or(config.seed);
+        config.init.sh_degree = self.sh_degree.unwrap_or(config.init.sh_degree);
+        config.density.max_gaussians = self.max_gaussians.or(config.density.max_gaussians);
+        if let Some(problem) = config.problem() {
+            return Err(Failure::BadInput(format!("settings: {problem}")));
+        }
+        if let Some(run) = resumed {
+            run.checkpoint.check_settings(&config)?;
+        }
+        Ok(config)
+    }
+
+    fn out(&self, resumed: Option<&Interrupted>, capture: &Capture) -> PathBuf {
+        let resumed = || resumed.map(|run| run.folder().to_owned());
+        let given = self.out.clone().or_else(resumed);
+        given.unwrap_or_else(|| Path::new("out").join(&capture.name))
+    }
+
+    /// Adds the folder of the photos, which is no setting of the run, to a command.
+    fn images(&self, line: CommandLine) -> CommandLine {
+        match &self.photos.images {
+            Some(folder) => line.option("--images", folder),
+            None => line,
+        }
+    }
+
+    /// What to type to go on with the run in `out`. Its settings are in the checkpoint.
+    fn resume_command(&self, out: &Path, global: &GlobalArgs) -> CommandLine {
+        let line = CommandLine::new("train", global).path(&self.capture);
+        let line = self.images(line.option("--resume", out));
+        match self.autosave {
+            AUTOSAVE => line,
+            seconds => line.option("--autosave", seconds.to_string().as_ref()),
+        }
+    }
+}
+
+/// Runs the command.
+pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> {
+    let resumed = args.resume.as_deref().map(Interrupted::open).transpose()?;
+    let config = args.config(resumed.as_ref(), global)?;
+    let options = CaptureOptions {
+        downscale: config.downscale,
+        ..args.photos.options()
+    };
+    let capture = Capture::load(&args.capture, &options)?;
+    capture.check_trainable()?;
+    for warning in &capture.warnings {
+        global.say(format_args!("warning: {warning}"));
+    }
+    if let Some(note) = picture_names(&capture).note() {
+        global.say(note);
+    }
+    let out = args.out(resumed.as_ref(), &capture);
+    resume::refuse_unfinished(&out, resumed.as_ref().map(|run| &*run.path))?;
+    let chosen = device::open(global)?;
+    global.say(format_args!(
+        "{}: {} photos to train on, {} held out, {} points",
+        capture.name,
+        capture.split.train.len(),
+        capture.split.test.len(),
+        capture.points.len()
+    ));
+    warn_of_settings(resumed.as_ref(), &config, capture.points.len(), global);
+
+    // What cannot be written down should be known before the training, not after it.
+    let checkpoint = resumed.map(|run| run.checkpoint);
+    let changes = checkpoint.as_ref().map(|run| run.changes_with(&config));
+    let changes = changes.unwrap_or_default();
+    let config_text = config_text(&out, args, global, &chosen, &config, &changes)?;
+    let fresh = checkpoint.is_none();
+    let capture = Arc::new(capture);
+    let progress = Progress::new(
+        config.steps as u64,
+        checkpoint.as_ref().map_or(0, Checkpoint::step) as u64,
+        global.quiet,
+    );
+    let progress = Rc::new(RefCell::new(progress));
+    let mut trainer = Trainer::builder()
+        .capture(capture.clone())
+        .config(config.clone())
+        .device(chosen.device.clone())
+        .interrupt(interrupt::flag()?)
+        .evaluate_every(config.steps.div_ceil(MEASUREMENTS));
+    if let Some(checkpoint) = checkpoint {
+        trainer = trainer.resume(checkpoint);
+    }
+    let file = out.join(CHECKPOINT);
+    let trainer = trainer.autosave(Duration::from_secs(args.autosave), move |checkpoint| {
+        checkpoint.save(&file)
+    });
+    let trainer = shown(trainer, &progress).build()?;
+
+    let resume = args.resume_command(&out, global);
+    let folder = RunFolder {
+        folder: &out,
+        config: &config_text,
+        resume: &resume,
+        global,
+    };
+    folder.probe(&capture)?;
+    if fresh && folder.is_taken() {
+        global.say(format_args!(
+            "{}: the results of an earlier run are replaced when this one ends or is interrupted",
+            out.display()
+        ));
+    }
+    let trained = trainer.run();
+    progress.borrow().finish();
+    let trained = trained.map_err(|error| folder.stopped(error.into()))?;
+
+    if trained.steps < config.steps {
+        folder.interrupted(&trained)?;
+        global.say(format_args!(
+            "stopped after {} of {} steps; to go on: {resume}",
+            trained.steps, config.steps
+        ));
+        return Ok(());
+    }
+    let (scores, saved) = folder.complete(&trained, &capture, &config, &chosen);
+    if let Some(scores) = scores.filter(|scores| !scores.views.is_empty()) {
+        print(&eval::table(&scores))?;
+    }
+    saved?;
+    print(&format!(
+        "{} Gaussians after {} steps in {:.1} s, in {}\n",
+        trained.gaussians.len(),
+        trained.steps,
+        trained.elapsed.as_secs_f64(),
+        out.display()
+    ))?;
+    Ok(())
+}
+
+/// Lets progress and warnings be seen.
+fn shown(trainer: TrainerBuilder, progress: &Rc<RefCell<Progress>>) -> TrainerBuilder {
+    let [shown, noted] = [progress, progress].map(Rc::clone);
+    trainer
+        .on_warning(move |warning| noted.borrow().note(&format!("warning: {warning}")))
+        .on_progress(move |state| {
+            shown.borrow_mut().update(state.step as u64, || {
+                let loss = state.history.mean_loss(LOSS_WINDOW);
+                let loss = loss.map_or_else(String::new, |loss| format!("loss {loss:.4}  "));
+                format!("{loss}{} Gaussians", state.gaussians)
+            });
+        })
+}
+
+/// Says what of the settings is not as one might think.
+fn warn_of_settings(
+    resumed: Option<&Interrupted>,
+    config: &TrainConfig,
+    points: usize,
+    global: &GlobalArgs,
+) {
+    let warn = |line: std::fmt::Arguments<'_>| global.say(format_args!("warning: {line}"));
+    let (count, what) = match resumed {
+        Some(run) => (
+            run.checkpoint.gaussians(),
+            "Gaussians that the run goes on with",
+        ),
+        None => (points, "points that training starts from"),
+    };
+    if let Some(most) = config.density.max_gaussians.filter(|most| *most < count) {
+        warn(format_args!(
+            "--max-gaussians {most} is below the {count} {what}: all of them are kept, and none is added unless pruning \
+             leaves fewer than {most}"
+        ));
+    }
+    let Some(run) = resumed else { return };
+    for change in run.checkpoint.changes_with(config) {
+        warn(format_args!(
+            "{change}; the run cannot be repeated from its config.toml alone"
+        ));
+    }
+    let path = run.folder().join(CONFIG);
+    let beside = path.is_file().then(|| text::read_config(&path));
+    let difference = match &beside {
+        Some(Ok(beside)) => run.checkpoint.config().difference_in_words(beside),
+        _ => None,
+    };
+    if let Some(difference) = difference {
+        warn(format_args!(
+            "{} is not read: the settings are those of the run's checkpoint ({difference})",
+            path.display()
+        ));
+    }
+}
+
+/// Everything needed to repeat the run, as TOML.
+fn config_text(
+    out: &Path,
+    args: &TrainArgs,
+    global: &GlobalArgs,
+    chosen: &ChosenDevice,
+    config: &TrainConfig,
+    changes: &[String],
+) -> Result<String, Failure> {
+    let repeat = args.images(CommandLine::new("train", global).path(&args.capture));
+    let repeat = repeat
+        .option("--config", &out.join(CONFIG))
+        .option("--out", out);
+    // A path with a line break would go on outside of the comment.
+    let repeat = repeat
+        .in_a_line()
+        .unwrap_or("splat train --config with this file");
+    let changes: String = changes
+        .iter()
+        .map(|change| format!("# not of the whole run: {change}\n"))
+        .collect();
+    Ok(format!(
+        "# splat {} on {}; to repeat: {repeat}\n{changes}{}",
+        env!("CARGO_PKG_VERSION"),
+        chosen.name,
+        toml::to_string(config)?
+    ))
+}

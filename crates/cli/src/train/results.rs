@@ -1,0 +1,318 @@
+//! The folder of a run: tried before the first step, written to when the run ends or is interrupted.
+//!
+//! What is worth most comes first: the scene, then the checkpoint, then what can be made again from them. Whatever
+//! cannot be saved, the rest is tried. The checkpoint is removed when all else is there, and not before.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use splat_data::scene::ply;
+
+use super::super::command_line::CommandLine;
+use super::super::device::ChosenDevice;
+use super::super::{Failure, GlobalArgs};
+use crate::report::curves::Curves;
+use crate::report::losses::write_losses;
+use crate::report::metrics::{Metrics, write_json};
+use crate::report::png::Picture;
+use crate::report::view_names::ViewNames;
+use crate::report::{ReportError, probe_file, probe_folder, refuse_inputs, write_durably};
+use splat_data::{Capture, View, WriteError};
+use splat_lab::memory::peak_rss_bytes;
+use splat_trainer::train::{CheckpointError, History, TrainConfig, Trained};
+use splat_trainer::{Scores, evaluate};
+
+/// The scene's file.
+pub(super) const SCENE: &str = "scene.ply";
+/// The checkpoint's file.
+pub(super) const CHECKPOINT: &str = "checkpoint.safetensors";
+/// The settings' file.
+pub(super) const CONFIG: &str = "config.toml";
+/// The figures' file, the last to be written.
+pub(super) const METRICS: &str = "metrics.json";
+const LOSSES: &str = "losses.csv";
+const CURVES: &str = "curves.svg";
+/// The pictures' folder.
+const VIEWS: &str = "views";
+
+/// Where a run leaves its results.
+pub(super) struct RunFolder<'a> {
+    pub folder: &'a Path,
+    /// What `config.toml` will hold.
+    pub config: &'a str,
+    /// What to type to go on with the run.
+    pub resume: &'a CommandLine,
+    pub global: &'a GlobalArgs,
+}
+
+/// What was saved, and what was not and why.
+#[derive(Default)]
+struct Saving {
+    saved: Vec<&'static str>,
+    failed: Vec<(&'static str, String)>,
+}
+
+impl Saving {
+    fn keep<E: Into<Failure>>(&mut self, name: &'static str, outcome: Result<(), E>) -> bool {
+        let saved = outcome.is_ok();
+        match outcome {
+            Ok(()) => self.saved.push(name),
+            Err(error) => self.failed.push((name, error.into().reason())),
+        }
+        saved
+    }
+}
+
+impl RunFolder<'_> {
+    /// Tries whether everything can be written, before it is worth anything, and without replacing a photo.
+    pub(super) fn probe(&self, capture: &Capture) -> Result<(), ReportError> {
+        let pictures = picture_names(capture).stems;
+        let pictures = pictures.iter().map(|stem| self.picture(stem));
+        let photos = capture.photo_files();
+        refuse_inputs(pictures, photos.iter().map(PathBuf::as_path))?;
+        probe_folder(self.folder)?;
+        for name in [SCENE, CHECKPOINT, CONFIG, METRICS, LOSSES, CURVES] {
+            probe_file(&self.folder.join(name))?;
+        }
+        let views = self.folder.join(VIEWS);
+        match views.exists() {
+            true => Ok(probe_folder(&views)?),
+            false => Ok(()),
+        }
+    }
+
+    /// The picture of a view.
+    fn picture(&self, stem: &str) -> PathBuf {
+        self.folder.join(VIEWS).join(format!("{stem}.png"))
+    }
+
+    /// Whether another run's results lie here.
+    pub(super) fn is_taken(&self) -> bool {
+        [SCENE, METRICS]
+            .iter()
+            .any(|name| self.folder.join(name).exists())
+    }
+
+    /// The error of a run that could not go on, with the way to go on from what was kept of it.
+    pub(super) fn stopped(&self, error: Failure) -> Failure {
+        if !self.folder.join(CHECKPOINT).is_file() {
+            return error;
+        }
+        Failure::BadInput(format!(
+            "{}; what was done before is kept, go on with: {}",
+            error.reason(),
+            self.resume
+        ))
+    }
+
+    /// Keeps an interrupted run.
+    pub(super) fn interrupted(&self, trained: &Trained) -> Result<(), Failure> {
+        let mut saving = Saving::default();
+        let scene = self.save_scene(&mut saving, trained);
+        saving.keep(CHECKPOINT, self.save_checkpoint(trained));
+        self.save_course(&mut saving, trained, scene);
+        self.note_other_pictures(&[]);
+        self.outcome(saving)
+    }
+
+    /// Keeps a complete run, measures it, and removes its checkpoint. The scores, if they could be measured, and whether
+    /// everything could be saved.
+    pub(super) fn complete(
+        &self,
+        trained: &Trained,
+        capture: &Capture,
+        config: &TrainConfig,
+        chosen: &ChosenDevice,
+    ) -> (Option<Scores>, Result<(), Failure>) {
+        let mut saving = Saving::default();
+        let scene = self.save_scene(&mut saving, trained);
+        if !scene && self.folder.join(SCENE).exists() {
+            // Beside the scene of another run nothing of this one may lie but what it can be gone on with from.
+            saving.keep(CHECKPOINT, self.save_checkpoint(trained));
+            return (None, self.outcome(saving));
+        }
+        self.save_course(&mut saving, trained, scene);
+        let scores = self.save_views(&mut saving, trained, capture, chosen);
+        if let Some(scores) = &scores {
+            let metrics = metrics(scores, trained, config, chosen);
+            saving.keep(METRICS, write_json(&self.folder.join(METRICS), &metrics));
+        }
+        if saving.failed.is_empty() {
+            return (scores, self.remove_checkpoint());
+        }
+        saving.keep(CHECKPOINT, self.save_checkpoint(trained));
+        (scores, self.outcome(saving))
+    }
+
+    /// Saves the scene. Figures of one that was here before are not its own, and go.
+    fn save_scene(&self, saving: &mut Saving, trained: &Trained) -> bool {
+        let path = self.folder.join(SCENE);
+        let saved = saving.keep(SCENE, ply::write(&path, &trained.to_data()));
+        if saved {
+            let _ = std::fs::remove_file(self.folder.join(METRICS));
+        }
+        saved
+    }
+
+    fn save_checkpoint(&self, trained: &Trained) -> Result<(), CheckpointError> {
+        trained.checkpoint()?.save(&self.folder.join(CHECKPOINT))
+    }
+
+    fn remove_checkpoint(&self) -> Result<(), Failure> {
+        let path = self.folder.join(CHECKPOINT);
+        match std::fs::remove_file(&path) {
+            Err(source) if source.kind() != std::io::ErrorKind::NotFound => {
+                Err(WriteError { path, source }.into())
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Saves the settings, unless the scene beside them is another one, and the course of the run.
+    fn save_course(&self, saving: &mut Saving, trained: &Trained, scene: bool) {
+        if scene || !self.folder.join(SCENE).exists() {
+            let path = self.folder.join(CONFIG);
+            let written = write_durably(&path, self.config.as_bytes());
+            saving.keep(
+                CONFIG,
+                written.map_err(|source| WriteError { path, source }),
+            );
+        }
+        let history = &trained.history;
+        saving.keep(LOSSES, write_losses(&self.folder.join(LOSSES), history));
+        saving.keep(CURVES, curves(history).write(&self.folder.join(CURVES)));
+    }
+
+    /// Measures the held-out views and saves their pictures.
+    fn save_views(
+        &self,
+        saving: &mut Saving,
+        trained: &Trained,
+        capture: &Capture,
+        chosen: &ChosenDevice,
+    ) -> Option<Scores> {
+        let views: Vec<&View> = capture.test_views().collect();
+        let names = picture_names(capture);
+        // Views come in the order given.
+        let mut stems = names.stems.iter();
+        let mut pictures = Vec::new();
+        let mut written = Ok(());
+        let keep = |view: &View, rendered: Vec<f32>| {
+            let Some(stem) = stems.next() else { return };
+            let path = self.picture(stem);
+            match write_view(&path, view, &rendered) {
+                Ok(()) => pictures.push(path),
+                Err(error) if written.is_ok() => written = Err(error),
+                Err(_) => {}
+            }
+        };
+        let settings = &trained.render_settings;
+        let scores = evaluate(&trained.gaussians, &views, settings, &chosen.device, keep);
+        if !views.is_empty() {
+            saving.keep(VIEWS, written);
+        }
+        self.note_other_pictures(&pictures);
+        match scores {
+            Ok(scores) => Some(scores),
+            Err(error) => {
+                saving.keep(METRICS, Err(error));
+                None
+            }
+        }
+    }
+
+    /// Says if there are pictures that are not of this scene. They may be somebody's, and stay.
+    fn note_other_pictures(&self, own: &[PathBuf]) {
+        let folder = self.folder.join(VIEWS);
+        let Ok(entries) = std::fs::read_dir(&folder) else {
+            return;
+        };
+        let paths = entries.filter_map(|entry| Some(entry.ok()?.path()));
+        let other = |path: &PathBuf| {
+            path.extension().is_some_and(|ending| ending == "png") && !own.contains(path)
+        };
+        let mut others: Vec<PathBuf> = paths.filter(other).collect();
+        others.sort();
+        if let Some(name) = others.first().and_then(|path| path.file_name()) {
+            self.global.say(format_args!(
+                "warning: {}: {} picture(s) were there before and are not of this scene, `{}` first",
+                folder.display(),
+                others.len(),
+                name.display()
+            ));
+        }
+    }
+
+    /// Nothing if everything was saved; else an error that says what was and what was not.
+    fn outcome(&self, saving: Saving) -> Result<(), Failure> {
+        let Some((_, reason)) = saving.failed.first() else {
+            return Ok(());
+        };
+        let list = |names: Vec<&str>| match names.is_empty() {
+            true => "nothing".to_owned(),
+            false => names.join(", "),
+        };
+        let failed = list(saving.failed.iter().map(|(name, _)| *name).collect());
+        let next = match self.folder.join(CHECKPOINT).is_file() {
+            true => format!("when that is mended, go on with: {}", self.resume),
+            false => "there is no checkpoint to go on from".to_owned(),
+        };
+        Err(Failure::BadInput(format!(
+            "{reason}; in {}, not saved: {failed}; saved: {}; {next}",
+            self.folder.display(),
+            list(saving.saved)
+        )))
+    }
+}
+
+fn metrics(
+    scores: &Scores,
+    trained: &Trained,
+    config: &TrainConfig,
+    chosen: &ChosenDevice,
+) -> Metrics {
+    let seconds = |time: Duration| time.as_secs_f64();
+    Metrics {
+        scores: scores.clone(),
+        gaussians: trained.gaussians.len(),
+        steps: trained.steps,
+        seconds: seconds(trained.elapsed),
+        seconds_per_step: seconds(trained.elapsed) / trained.steps as f64,
+        peak_rss_bytes: peak_rss_bytes(),
+        device_bytes: chosen
+            .device
+            .memory_pool_usage()
+            .map(|usage| usage.bytes_reserved),
+        device: chosen.name.clone(),
+        seed: config.seed,
+    }
+}
+
+/// The names of the held-out views' pictures.
+pub(super) fn picture_names(capture: &Capture) -> ViewNames {
+    let names = capture.test_views().map(|view| view.name.as_str());
+    ViewNames::new(names, &[""])
+}
+
+/// Writes truth beside render.
+fn write_view(path: &Path, view: &View, rendered: &[f32]) -> Result<(), ReportError> {
+    let truth = Picture::from_rgb8(view.width, view.height, view.image.to_vec())?;
+    let render = Picture::from_rgb_f32(view.width, view.height, rendered)?;
+    truth.beside(&render)?.write(path)
+}
+
+/// The course of the run: the weighted sum, then each term.
+fn curves(history: &History) -> Curves {
+    let mut curves = Curves {
+        held_out_psnr: history.held_out_psnr.clone(),
+        gaussians: history.counts.clone(),
+        ..Curves::default()
+    };
+    for record in &history.losses {
+        curves.push_loss("loss", record.step, f64::from(record.total));
+        for (name, &value) in history.terms.iter().zip(&record.terms) {
+            curves.push_loss(name, record.step, f64::from(value));
+        }
+    }
+    curves
+}

@@ -1,0 +1,509 @@
+//! The rasteriser: (pixel, Gaussian) evaluations per second and core (or per CubeCL device), on the lists of a real
+//! scene.
+
+use std::fmt::Write;
+use std::time::{Duration, Instant};
+
+use burn::tensor::Device;
+use serde::Serialize;
+use splat_data::SplatData;
+use splat_model::{CameraTensors, Gaussians, RenderSettings, render};
+use splat_ops::RasterizeSettings;
+use splat_ops::cpu::InstructionSet;
+use splat_ops::device::describe;
+
+use super::arithmetic::{self, Arithmetic};
+use super::device_step::write_device;
+use super::stages::{Recording, Stage};
+use super::work::sample;
+use super::{Machine, PerformanceError, Spread, Work, all_threads, on_threads};
+use splat_data::View;
+use splat_trainer::photo;
+
+/// Views rendered.
+const VIEWS: usize = 8;
+/// Passes over the views before the clock starts.
+const WARM_UP: usize = 1;
+/// Passes over the views that are measured, unless time is up.
+const PASSES: usize = 30;
+
+/// 1e9 evaluations per second and core.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Limit {
+    /// What the arithmetic of the inner loop reached on a machine with AVX-512: a tile of 16 x 16 pixels with 256 splats,
+    /// in cache, forward and backward. Not all of it was measured.
+    reached: [Option<f64>; 2],
+    /// What the rasteriser shall reach, forward and backward.
+    goal: Option<[f64; 2]>,
+}
+
+const AVX512: Limit = Limit {
+    reached: [Some(3.6), Some(1.2)],
+    goal: Some([2.5, 0.8]),
+};
+
+const AVX2: Limit = Limit {
+    reached: [Some(2.0), None],
+    goal: Some([1.4, 0.5]),
+};
+
+const BASELINE: Limit = Limit {
+    reached: [None; 2],
+    goal: None,
+};
+
+/// The same of scalar code with libm, forward.
+const SCALAR: f64 = 0.1;
+
+/// The limit of the instructions that ran. None was measured for NEON, whose vectors are half of AVX2's; it is held
+/// against AVX2.
+fn limit(instructions: InstructionSet) -> Limit {
+    match instructions {
+        InstructionSet::Avx512 => AVX512,
+        InstructionSet::Avx2 | InstructionSet::Neon => AVX2,
+        InstructionSet::Baseline => BASELINE,
+    }
+}
+
+/// The rasteriser on the views of a capture.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RasterizeReport {
+    /// Where and when.
+    pub machine: Machine,
+    /// What is known of the CubeCL device that rendered; absent where it was the CPU.
+    pub device: Option<Vec<(&'static str, String)>>,
+    /// What was rendered.
+    pub scene: String,
+    /// The work of a view.
+    pub work: Work,
+    /// One per number of threads and set of instructions; one of one thread for a device.
+    pub rows: Vec<RasterizeRow>,
+}
+
+/// A number of threads that run the same instructions.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RasterizeRow {
+    /// Threads.
+    pub threads: usize,
+    /// What the inner loops ran with; absent where a device rendered.
+    pub instructions: Option<String>,
+    /// What they are held against.
+    #[serde(skip)]
+    limit: Option<Limit>,
+    /// Passes over the views.
+    pub passes: usize,
+    /// Tile lists, milliseconds per view. Absent where the rasteriser does not time them apart from the blending.
+    pub lists: Option<Spread>,
+    /// Blending, with the lists where these are not apart.
+    pub forward: Rate,
+    /// Its gradient.
+    pub backward: Rate,
+    /// Its gradient again, summed as it comes; of a CubeCL device only.
+    pub backward_unordered: Option<Rate>,
+    /// What the order costs: the time of `backward` by that of `backward_unordered`, one after the other on each view and
+    /// summed over the views of a pass.
+    pub cost_of_order: Option<Spread>,
+    /// What so many threads of the CPU reach side by side without lists, spans and memory; absent where a device rendered.
+    pub possible: Option<Arithmetic>,
+    /// Milliseconds per view of projection, colours and rasteriser together, and of their gradients; of a CubeCL device
+    /// only, idle before and after.
+    pub render_forward_milliseconds: Option<Spread>,
+    /// See above.
+    pub render_backward_milliseconds: Option<Spread>,
+}
+
+/// How fast the evaluations of a view are done. Both directions count those of the forward pass.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Rate {
+    /// Milliseconds per view.
+    pub milliseconds: Spread,
+    /// Pairs tested per second and thread, in the median time.
+    pub tested_per_second: f64,
+    /// Pairs blended per second and thread, in the median time.
+    pub blended_per_second: f64,
+}
+
+impl Rate {
+    fn new(milliseconds: Vec<f64>, work: &Work, threads: usize) -> Self {
+        let milliseconds = Spread::of(milliseconds);
+        let seconds = 1e-3 * milliseconds.median * threads as f64;
+        Self {
+            milliseconds,
+            tested_per_second: work.tested / seconds,
+            blended_per_second: work.blended / seconds,
+        }
+    }
+}
+
+/// Measures the rasteriser of `device` on up to eight of `views`, that of the CPU on one thread and on all; `seconds`
+/// bounds the time of each. A CubeCL device is waited for where the rasteriser begins and ends.
+///
+/// # Errors
+/// When the scene cannot be rendered.
+pub fn measure(
+    scene: &str,
+    data: &SplatData,
+    views: &[&View],
+    settings: &RenderSettings,
+    device: &Device,
+    seconds: f64,
+    mut say: impl FnMut(&str),
+) -> Result<RasterizeReport, PerformanceError> {
+    let views = sample(views, VIEWS);
+    say("counting the work");
+    let work = Work::count(
+        &Gaussians::from_data(data, device),
+        &views,
+        settings,
+        device,
+    )?;
+    let facts = describe(device);
+    let mut rows = vec![];
+    let runs: Vec<_> = match facts {
+        Some(_) => vec![(1, None)],
+        None => all_threads()
+            .into_iter()
+            .flat_map(|threads| {
+                InstructionSet::available()
+                    .into_iter()
+                    .map(move |set| (threads, Some(set)))
+            })
+            .collect(),
+    };
+    for (threads, set) in runs {
+        let with = set.map_or(String::new(), |set| format!(" with {set}"));
+        say(&format!(
+            "rasterising {} views on {threads} thread(s){with}",
+            views.len()
+        ));
+        let measured = || {
+            let possible = match set {
+                Some(_) => Some(arithmetic::measure(threads)?),
+                None => None,
+            };
+            let passes = on_threads(threads, || passes(data, &views, settings, device, seconds))?;
+            Ok::<_, PerformanceError>((possible, passes))
+        };
+        let (possible, passes) = match set {
+            Some(set) => set.at_most(measured)?,
+            None => measured()?,
+        };
+        let per_view = |pass: &Pass, time: fn(&Pass) -> Duration| {
+            1e3 * time(pass).as_secs_f64() / views.len() as f64
+        };
+        let times =
+            |time: fn(&Pass) -> Duration| passes.iter().map(|pass| per_view(pass, time)).collect();
+        let apart = passes.iter().any(|pass| !pass.lists.is_zero());
+        rows.push(RasterizeRow {
+            threads,
+            instructions: set.map(|set| set.to_string()),
+            limit: set.map(limit),
+            passes: passes.len(),
+            lists: apart.then(|| Spread::of(times(|pass| pass.lists))),
+            forward: Rate::new(times(|pass| pass.forward), &work, threads),
+            backward: Rate::new(times(|pass| pass.backward), &work, threads),
+            backward_unordered: facts
+                .is_some()
+                .then(|| Rate::new(times(|pass| pass.unordered), &work, threads)),
+            cost_of_order: facts
+                .is_some()
+                .then(|| Spread::of(passes.iter().map(Pass::cost_of_order).collect())),
+            possible,
+            render_forward_milliseconds: facts
+                .is_some()
+                .then(|| Spread::of(times(|pass| pass.render_forward))),
+            render_backward_milliseconds: facts
+                .is_some()
+                .then(|| Spread::of(times(|pass| pass.render_backward))),
+        });
+    }
+    Ok(RasterizeReport {
+        machine: Machine::here(),
+        device: facts,
+        scene: scene.to_owned(),
+        work,
+        rows,
+    })
+}
+
+/// Time of the rasteriser's spans over all views, and of the whole render on a CubeCL device.
+#[derive(Default)]
+struct Pass {
+    lists: Duration,
+    forward: Duration,
+    backward: Duration,
+    /// `backward`, summed as it comes.
+    unordered: Duration,
+    render_forward: Duration,
+    render_backward: Duration,
+}
+
+impl Pass {
+    fn add(&mut self, stages: &[Stage]) {
+        for stage in stages {
+            match stage.name {
+                "rasterize lists" => self.lists += stage.whole,
+                "rasterize" => self.forward += stage.own,
+                "rasterize gradient" => self.backward += stage.own,
+                _ => {}
+            }
+        }
+    }
+
+    /// Of the same views, summed as it comes.
+    fn add_unordered(&mut self, stages: &[Stage]) {
+        let gradients = stages
+            .iter()
+            .filter(|stage| stage.name == "rasterize gradient");
+        self.unordered += gradients.map(|stage| stage.own).sum::<Duration>();
+    }
+
+    fn cost_of_order(&self) -> f64 {
+        self.backward.as_secs_f64() / self.unordered.as_secs_f64()
+    }
+}
+
+/// Renders the views and goes back through them, again and again; a CubeCL device three times: waited for by stages, with
+/// sums in order and without, and as a whole.
+fn passes(
+    data: &SplatData,
+    views: &[&View],
+    settings: &RenderSettings,
+    device: &Device,
+    seconds: f64,
+) -> Result<Vec<Pass>, PerformanceError> {
+    let waited_for = describe(device).is_some().then(|| device.clone());
+    let unordered = waited_for.as_ref().map(|_| RenderSettings {
+        rasterize: RasterizeSettings {
+            deterministic: false,
+            ..settings.rasterize
+        },
+        ..settings.clone()
+    });
+    let device = device.clone().autodiff();
+    let gaussians = Gaussians::from_data(data, &device);
+    let inputs: Vec<_> = views
+        .iter()
+        .map(|view| {
+            let camera = view.camera().relative_to(gaussians.origin);
+            (
+                CameraTensors::from_camera(&camera, &device),
+                photo(view, &device),
+            )
+        })
+        .collect();
+    let record = |recording: &Recording| {
+        let mut passes = vec![];
+        let start = Instant::now();
+        for number in 0..WARM_UP + PASSES {
+            let mut pass = Pass::default();
+            for (at, (cameras, photo)) in inputs.iter().enumerate() {
+                let stages = |settings: &RenderSettings| -> Result<_, PerformanceError> {
+                    let rendered = render(&gaussians, cameras, settings)?;
+                    let difference = rendered.image() - photo.clone();
+                    difference.square().mean().backward();
+                    Ok(recording.take())
+                };
+                // What comes first on one view comes second on the next.
+                let first = unordered.as_ref().filter(|_| (number + at) % 2 == 0);
+                if let Some(settings) = first {
+                    pass.add_unordered(&stages(settings)?);
+                }
+                pass.add(&stages(settings)?);
+                if let (Some(settings), None) = (&unordered, first) {
+                    pass.add_unordered(&stages(settings)?);
+                }
+            }
+            if number >= WARM_UP {
+                passes.push(pass);
+                if start.elapsed().as_secs_f64() > seconds {
+                    break;
+                }
+            }
+        }
+        Ok(passes)
+    };
+    let Some(device) = waited_for else {
+        return Recording::of(record);
+    };
+    let mut passes: Vec<Pass> = Recording::on_device(&device, record)?;
+    // Nobody listens now, so that within these the device is not waited for.
+    for pass in &mut passes {
+        for (cameras, photo) in &inputs {
+            device.sync()?;
+            let start = Instant::now();
+            let rendered = render(&gaussians, cameras, settings)?;
+            device.sync()?;
+            pass.render_forward += start.elapsed();
+            let loss = (rendered.image() - photo.clone()).square().mean();
+            device.sync()?;
+            let start = Instant::now();
+            loss.backward();
+            device.sync()?;
+            pass.render_backward += start.elapsed();
+        }
+    }
+    Ok(passes)
+}
+
+impl RasterizeReport {
+    /// The tables.
+    pub fn markdown(&self) -> String {
+        let mut text = String::new();
+        // Writing into a string cannot fail.
+        let _ = self.write(&mut text);
+        text
+    }
+
+    fn write_device(
+        &self,
+        text: &mut String,
+        facts: &[(&'static str, String)],
+    ) -> std::fmt::Result {
+        write_device(text, facts)?;
+        writeln!(
+            text,
+            "\nTime per view, the device waited for before and after, and 1e9 pairs per second. Forward includes making the \
+             lists. A pair is tested where a block of the tile, whose pixels walk together, meets the ellipse.\n"
+        )?;
+        writeln!(
+            text,
+            "| direction | median ms | min | max | tested | blended |"
+        )?;
+        writeln!(text, "|---|{}", "--:|".repeat(5))?;
+        for row in &self.rows {
+            let directions = [
+                ("forward", Some(row.forward)),
+                ("backward, summed in order", Some(row.backward)),
+                ("backward, summed as it comes", row.backward_unordered),
+            ];
+            for (direction, rate) in directions {
+                let Some(rate) = rate else { continue };
+                let Spread { median, min, max } = rate.milliseconds;
+                writeln!(
+                    text,
+                    "| {direction} | {median:.2} | {min:.2} | {max:.2} | {:.3} | {:.3} |",
+                    1e-9 * rate.tested_per_second,
+                    1e-9 * rate.blended_per_second
+                )?;
+            }
+            let whole = [
+                (
+                    "projection, colours and forward",
+                    row.render_forward_milliseconds,
+                ),
+                ("all of backward", row.render_backward_milliseconds),
+            ];
+            for (direction, milliseconds) in whole {
+                if let Some(Spread { median, min, max }) = milliseconds {
+                    writeln!(
+                        text,
+                        "| {direction} | {median:.2} | {min:.2} | {max:.2} | | |"
+                    )?;
+                }
+            }
+        }
+        for row in &self.rows {
+            if let Some(Spread { median, min, max }) = row.cost_of_order {
+                writeln!(
+                    text,
+                    "\nSums in order take {median:.3} times as long as sums that are added as they come ({min:.3} to {max:.3} over \
+                     {} passes), view by view one after the other.",
+                    row.passes
+                )?;
+            }
+        }
+        Ok(())
+    }
+
+    fn write(&self, text: &mut String) -> std::fmt::Result {
+        writeln!(text, "Scene: {}.\n", self.scene)?;
+        writeln!(text, "{}", self.work.markdown())?;
+        if let Some(facts) = &self.device {
+            return self.write_device(text, facts);
+        }
+        writeln!(
+            text,
+            "Time per view, and 1e9 pairs per second and thread, with each set of instructions that the processor has; goal and \
+             share of the limit are those of the set.{}\n",
+            if self.rows.iter().any(|row| row.lists.is_none()) {
+                " Forward includes making the lists."
+            } else {
+                ""
+            }
+        )?;
+        writeln!(
+            text,
+            "| threads | instructions | direction | median ms | min | max | tested | blended | goal, tested | share of what is \
+             possible here | share of the limit |"
+        )?;
+        writeln!(text, "|--:|---|---|{}", "--:|".repeat(8))?;
+        for row in &self.rows {
+            let Some(limit) = row.limit else { continue };
+            let threads = format!(
+                "{} | {}",
+                row.threads,
+                row.instructions.as_deref().unwrap_or_default()
+            );
+            if let Some(Spread { median, min, max }) = row.lists {
+                writeln!(
+                    text,
+                    "| {threads} | lists | {median:.2} | {min:.2} | {max:.2} | | | | | |"
+                )?;
+            }
+            let goals = limit.goal.map_or([None; 2], |goal| goal.map(Some));
+            let here = row.possible;
+            let here = [
+                here.map(|here| here.forward),
+                here.map(|here| here.backward),
+            ];
+            let directions = [("forward", row.forward), ("backward", row.backward)];
+            let held_against = goals.into_iter().zip(here).zip(limit.reached);
+            for ((direction, rate), ((goal, here), limit)) in
+                directions.into_iter().zip(held_against)
+            {
+                let Spread { median, min, max } = rate.milliseconds;
+                let tested = 1e-9 * rate.tested_per_second;
+                let blended = 1e-9 * rate.blended_per_second;
+                let goal = goal.map_or(String::new(), |goal| format!("{goal:.1}"));
+                let share = |limit: Option<f64>| {
+                    limit.map_or("not measured".to_owned(), |limit| {
+                        format!("{:.0} %", 100.0 * tested / limit)
+                    })
+                };
+                let (here, share) = (share(here), share(limit));
+                writeln!(
+                    text,
+                    "| {threads} | {direction} | {median:.2} | {min:.2} | {max:.2} | {tested:.2} | {blended:.2} | {goal} | \
+                     {here} | {share} |"
+                )?;
+            }
+        }
+        writeln!(
+            text,
+            "\nPossible here is what the same loops reach on this machine in the same run where every pixel of a tile blends \
+             every splat and all is in cache, each thread by itself:"
+        )?;
+        for row in &self.rows {
+            if let Some(Arithmetic { forward, backward }) = row.possible {
+                let which = match row.threads {
+                    1 => "1 thread".to_owned(),
+                    threads => format!("each of {threads} threads"),
+                };
+                let set = row.instructions.as_deref().unwrap_or_default();
+                writeln!(
+                    text,
+                    "- {which}, {set}: forward {forward:.2}, backward {backward:.2}"
+                )?;
+            }
+        }
+        let [avx512, avx2] = [AVX512, AVX2].map(|set| set.reached.map(Option::unwrap_or_default));
+        writeln!(
+            text,
+            "\nThe limit is what the arithmetic alone reached on one core of a machine with AVX-512, on a tile of 16 x 16 \
+             pixels with 256 splats in cache: forward {:.1} with AVX-512, {:.1} with AVX2, {:.1} in scalar code with libm; \
+             backward {:.1} with AVX-512.",
+            avx512[0], avx2[0], SCALAR, avx512[1]
+        )
+    }
+}

@@ -1,0 +1,101 @@
+//! Sizes and settings of the ops. Every constant of the method is a field here, with its default.
+
+/// Size of the rendered image in pixels. The centre of pixel (i, j) lies at (i + 0.5, j + 0.5).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ImageSize {
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+/// Smallest opacity that still changes an 8-bit image (3DGS appendix C).
+const ALPHA_MIN: f64 = 1.0 / 255.0;
+
+/// Settings of `project`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ProjectSettings {
+    /// Splats with camera z below this are culled. World units. Default 0.01 (gsplat).
+    pub near: f64,
+    /// Splats with camera z above this are culled. World units. Default 1e10 (gsplat).
+    pub far: f64,
+    /// Low-pass filter: variance added to the diagonal of the 2D covariance, in pixels squared.
+    /// Default 0.3 (3DGS reference implementation).
+    pub eps2d: f64,
+    /// The Jacobian of the projection is evaluated at most this share of the image's width
+    /// (height) outside of it. Default 0.15.
+    pub clamp_margin: f64,
+    /// Opacity at which a splat's extent ends. Default 1/255 (3DGS appendix C).
+    pub alpha_min: f64,
+}
+
+impl Default for ProjectSettings {
+    fn default() -> Self {
+        Self {
+            near: 0.01,
+            far: 1e10,
+            eps2d: 0.3,
+            clamp_margin: 0.15,
+            alpha_min: ALPHA_MIN,
+        }
+    }
+}
+
+/// Settings of `rasterize`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RasterizeSettings {
+    /// A splat is skipped at a pixel where its alpha is below this, which is above 0. Default 1/255 (3DGS appendix C).
+    pub alpha_min: f64,
+    /// Alpha is capped here, below 1; the gradient through a capped alpha is zero. Default 0.99 (3DGS appendix C).
+    pub alpha_max: f64,
+    /// A pixel stops before its transmittance would fall below this; never, if it is 0. Default 9.999e-5: the 1e-4 of
+    /// 3DGS appendix C less one part in 10,000, because two splats at the cap leave exactly 1e-4,
+    /// which rounds to either side.
+    pub transmittance_min: f64,
+    /// Whether the same input gives the same gradients, bit for bit, every time. Default true. False, on a CubeCL device:
+    /// the tiles' shares of a splat's gradient are added up as they come, which differs from run to run in the last digits.
+    /// It saves memory, 24 bytes and 4 per channel of each (splat, tile) pair in the backward pass, and from the forward
+    /// pass on 4 of each pair and 12 of each Gaussian and camera; docs/GPU.md has what it does to the time. The CPU sums
+    /// in order in any case.
+    pub deterministic: bool,
+}
+
+impl Default for RasterizeSettings {
+    fn default() -> Self {
+        Self {
+            alpha_min: ALPHA_MIN,
+            alpha_max: 0.99,
+            transmittance_min: 9.999e-5,
+            deterministic: true,
+        }
+    }
+}
+
+/// Gradient of the clamp of colours at zero, `max(x, 0)`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum ClampGradient {
+    /// The derivative: nothing passes below zero.
+    #[default]
+    Exact,
+    /// The derivative, and below zero also a gradient whose descent raises the channel. A channel that has slipped
+    /// below zero in every view would otherwise stay black for good, since nothing could ever reach it. For training.
+    Recovering,
+}
+
+/// Settings of `sh_colors`. A degree alone becomes settings by [`From`], with the exact gradient.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub struct ShColorSettings {
+    /// Degree of the spherical harmonics, 0 to 3. Default 0.
+    pub degree: usize,
+    /// Gradient of the clamp at zero. Default exact.
+    pub clamp_gradient: ClampGradient,
+}
+
+impl From<usize> for ShColorSettings {
+    fn from(degree: usize) -> Self {
+        Self {
+            degree,
+            ..Self::default()
+        }
+    }
+}

@@ -1,0 +1,289 @@
+//! Photos: found, decoded once and in parallel, fitted to their cameras, kept as 8-bit RGB.
+
+mod folders;
+
+use std::io::Cursor;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use image::{DynamicImage, ImageError, ImageFormat, ImageReader};
+use rayon::prelude::*;
+use splat_core::memory::available_memory;
+
+use super::colmap::{Camera, Image, SparseModel};
+use super::{CaptureError, CaptureOptions, CaptureWarning, View, downscale, jpeg};
+
+/// Least width and height of a photo: the window of SSIM.
+pub(super) const MIN_SIDE: u32 = 11;
+
+/// The folder of the photos.
+pub(super) fn folder(
+    root: &Path,
+    model: &SparseModel,
+    options: &CaptureOptions,
+) -> Result<PathBuf, CaptureError> {
+    folders::of_photos(root, options.images.as_deref(), model)
+}
+
+/// Loads the photo of every image of the model. The views come in the order of the model's images.
+pub(super) fn load(
+    root: &Path,
+    folder: &Path,
+    model: &SparseModel,
+    options: &CaptureOptions,
+    warnings: &mut Vec<CaptureWarning>,
+) -> Result<Vec<View>, CaptureError> {
+    // Look for every photo before decoding any: the likeliest mistake is found at once.
+    for image in &model.images {
+        let path = folder.join(&image.name);
+        if !path.is_file() {
+            return Err(CaptureError::MissingPhoto {
+                path,
+                image: image.name.clone(),
+                elsewhere: folders::elsewhere(root, folder, model),
+            });
+        }
+    }
+    let factor = options.downscale;
+    check_memory(root, folder, model, factor, available_memory())?;
+    let loaded: Vec<Result<Loaded, CaptureError>> = model
+        .images
+        .par_iter()
+        .map(|image| load_one(folder, image, &model.cameras[&image.camera_id], factor))
+        .collect();
+    let loaded = loaded.into_iter().collect::<Result<Vec<_>, _>>()?;
+    warnings.extend(rescaled(&loaded));
+    warnings.extend(transparent(&loaded));
+    warnings.extend(damaged(&loaded));
+    warnings.extend(folders::unregistered(root, folder, model));
+    Ok(loaded.into_iter().map(|loaded| loaded.view).collect())
+}
+
+/// Refuses photos that memory could not hold: the allocation that failed would end the process.
+pub(super) fn check_memory(
+    root: &Path,
+    folder: &Path,
+    model: &SparseModel,
+    factor: u32,
+    left: Option<u64>,
+) -> Result<(), CaptureError> {
+    let bytes = |sides: [u32; 2]| {
+        let [width, height] = sides.map(|side| u64::from(side.div_ceil(factor)));
+        width.saturating_mul(height).saturating_mul(3)
+    };
+    let of_camera = |image: &Image| {
+        let camera = &model.cameras[&image.camera_id];
+        bytes([camera.width, camera.height])
+    };
+    let Some(left) = left else { return Ok(()) };
+    // Photos may have another size than their cameras; but to look at each takes time, and mostly there is far more memory
+    // than they take.
+    const AMPLE: u64 = 64;
+    let by_cameras = model.images.iter().map(of_camera);
+    if by_cameras.fold(0, u64::saturating_add) <= left / AMPLE {
+        return Ok(());
+    }
+    let size = |path: &Path| -> Option<(u32, u32)> {
+        let reader = ImageReader::open(path).ok()?;
+        // By what is in the file, whatever its name.
+        reader.with_guessed_format().ok()?.into_dimensions().ok()
+    };
+    // What cannot be read is told when it is decoded.
+    let of_photo = |image: &Image| {
+        size(&folder.join(&image.name)).map_or(0, |(width, height)| bytes([width, height]))
+    };
+    let photos = model.images.par_iter().map(of_photo);
+    let needed = photos.reduce(|| 0, u64::saturating_add);
+    if needed <= left {
+        return Ok(());
+    }
+    Err(CaptureError::OutOfMemory {
+        root: root.to_path_buf(),
+        photos: model.images.len(),
+        needed,
+        left,
+        downscale: factor,
+    })
+}
+
+/// A view and what was odd about its photo.
+struct Loaded {
+    view: View,
+    transparent: bool,
+    /// Whether its file is likely damaged, though its picture is whole.
+    suspect: bool,
+    /// Sizes of photo and camera where they differ.
+    rescaled: Option<[[u32; 2]; 2]>,
+}
+
+fn load_one(
+    folder: &Path,
+    image: &Image,
+    camera: &Camera,
+    factor: u32,
+) -> Result<Loaded, CaptureError> {
+    let path = folder.join(&image.name);
+    let mut file = PhotoFile::open(&path)?;
+    let size = file.size(&path)?;
+    let camera_size = [camera.width, camera.height];
+    let Some(mut intrinsics) = fit_intrinsics(camera, size) else {
+        return Err(CaptureError::PhotoSize {
+            path,
+            photo: size,
+            camera_id: camera.id,
+            camera: camera_size,
+        });
+    };
+    let suspect = file.check_whole(&path)?;
+    let photo = file.decode(&path)?;
+
+    let (mut pixels, transparent) = opaque_rgb(photo);
+    let [mut width, mut height] = size;
+    if factor > 1 {
+        (pixels, width, height) = downscale::area_average(&pixels, width, height, factor);
+        intrinsics = downscale::intrinsics(intrinsics, factor);
+    }
+    if width < MIN_SIDE || height < MIN_SIDE {
+        return Err(CaptureError::PhotoTooSmall {
+            path,
+            size: [width, height],
+            downscale: factor,
+            min: MIN_SIDE,
+        });
+    }
+    Ok(Loaded {
+        view: View {
+            name: image.name.clone(),
+            width,
+            height,
+            intrinsics,
+            viewmat: image.viewmat(),
+            image: Arc::new(pixels),
+        },
+        transparent,
+        suspect,
+        rescaled: (size != camera_size).then_some([size, camera_size]),
+    })
+}
+
+/// A photo's file in memory.
+struct PhotoFile {
+    bytes: Vec<u8>,
+    format: ImageFormat,
+}
+
+impl PhotoFile {
+    fn open(path: &Path) -> Result<Self, CaptureError> {
+        let bytes = std::fs::read(path).map_err(|source| CaptureError::Io {
+            path: path.to_path_buf(),
+            source,
+        })?;
+        let format = image::guess_format(&bytes).map_err(|error| undecodable(path, &error))?;
+        Ok(Self { bytes, format })
+    }
+
+    /// Width and height.
+    fn size(&self, path: &Path) -> Result<[u32; 2], CaptureError> {
+        let size = self.reader().into_dimensions();
+        size.map(<[u32; 2]>::from)
+            .map_err(|error| undecodable(path, &error))
+    }
+
+    /// Refuses a photo of which a part is missing, where the decoder would not; whether the file
+    /// looks damaged all the same. (Of a PNG file every part has a checksum, which the decoder checks.)
+    fn check_whole(&mut self, path: &Path) -> Result<bool, CaptureError> {
+        if self.format != ImageFormat::Jpeg {
+            return Ok(false);
+        }
+        let whole = jpeg::check(&self.bytes).map_err(|reason| CaptureError::IncompletePhoto {
+            path: path.to_path_buf(),
+            reason,
+        })?;
+        if !whole.ended {
+            // Without it the decoder makes up the last rows although they are there.
+            self.bytes.extend(jpeg::END);
+        }
+        Ok(whole.suspect)
+    }
+
+    /// The photo as stored: like COLMAP, without turning it by its EXIF orientation.
+    fn decode(&self, path: &Path) -> Result<DynamicImage, CaptureError> {
+        self.reader()
+            .decode()
+            .map_err(|error| undecodable(path, &error))
+    }
+
+    fn reader(&self) -> ImageReader<Cursor<&[u8]>> {
+        ImageReader::with_format(Cursor::new(&self.bytes), self.format)
+    }
+}
+
+fn undecodable(path: &Path, error: &ImageError) -> CaptureError {
+    CaptureError::UndecodablePhoto {
+        path: path.to_path_buf(),
+        reason: error.to_string().replace('\n', " "),
+    }
+}
+
+/// The camera's intrinsics for a photo of `size`, or nothing where the photo's shape is not the camera's.
+///
+/// A rescale counts as uniform where one factor explains both sides to within a pixel (sizes are rounded). The sides
+/// are then scaled each by its own ratio, so that the photo's edges stay the camera's edges.
+fn fit_intrinsics(camera: &Camera, size: [u32; 2]) -> Option<[f64; 4]> {
+    let [fx, fy, cx, cy] = camera.intrinsics;
+    let [w, h] = size.map(f64::from);
+    let [cam_w, cam_h] = [camera.width, camera.height].map(f64::from);
+    let least = ((w - 1.0) / cam_w).max((h - 1.0) / cam_h);
+    let most = ((w + 1.0) / cam_w).min((h + 1.0) / cam_h);
+    let (sx, sy) = (w / cam_w, h / cam_h);
+    (least <= most).then_some([fx * sx, fy * sy, cx * sx, cy * sy])
+}
+
+/// 8-bit RGB, transparent pixels put on black; and whether there were any.
+fn opaque_rgb(photo: DynamicImage) -> (Vec<u8>, bool) {
+    if !photo.color().has_alpha() {
+        return (photo.into_rgb8().into_raw(), false);
+    }
+    let rgba = photo.into_rgba8();
+    let transparent = rgba.pixels().any(|pixel| pixel.0[3] != 255);
+    let on_black = |value: u8, alpha: u8| ((u32::from(value) * u32::from(alpha) + 127) / 255) as u8;
+    let pixels = rgba
+        .pixels()
+        .flat_map(|pixel| {
+            let [r, g, b, a] = pixel.0;
+            [on_black(r, a), on_black(g, a), on_black(b, a)]
+        })
+        .collect();
+    (pixels, transparent)
+}
+
+fn rescaled(loaded: &[Loaded]) -> Option<CaptureWarning> {
+    let mut odd = loaded
+        .iter()
+        .filter_map(|loaded| Some((&loaded.view.name, loaded.rescaled?)));
+    let (first, [photo, camera]) = odd.next()?;
+    Some(CaptureWarning::RescaledPhotos {
+        count: 1 + odd.count(),
+        first: first.clone(),
+        photo,
+        camera,
+    })
+}
+
+fn transparent(loaded: &[Loaded]) -> Option<CaptureWarning> {
+    let mut odd = loaded.iter().filter(|loaded| loaded.transparent);
+    let first = odd.next()?.view.name.clone();
+    Some(CaptureWarning::TransparentPhotos {
+        count: 1 + odd.count(),
+        first,
+    })
+}
+
+fn damaged(loaded: &[Loaded]) -> Option<CaptureWarning> {
+    let mut odd = loaded.iter().filter(|loaded| loaded.suspect);
+    let first = odd.next()?.view.name.clone();
+    Some(CaptureWarning::DamagedPhotos {
+        count: 1 + odd.count(),
+        first,
+    })
+}

@@ -1,0 +1,246 @@
+//! Captures: photos with their cameras and the points that structure from motion found.
+//!
+//! [`Capture::load`] reads a folder in COLMAP's layout, decodes every photo once and in parallel, and returns plain
+//! data: nothing here knows a tensor or prints a line. What is odd but usable comes back as
+//! [`Capture::warnings`]; what is not is a [`CaptureError`] that names the file, the record and what to do.
+//!
+//! Conventions (those of the whole project): right-handed world; camera axes +x right, +y down, +z forward; the view
+//! matrix maps world to camera; the centre of pixel (i, j) lies at (i + 0.5, j + 0.5).
+
+mod colmap;
+mod colmap_binary;
+mod colmap_text;
+mod downscale;
+mod error;
+mod images;
+#[doc(hidden)]
+pub mod in_memory;
+mod jpeg;
+mod save;
+mod split;
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use glam::{DMat4, DVec4};
+use splat_core::ImageSize;
+
+use crate::Camera;
+
+pub use error::{CaptureError, CaptureWarning};
+pub use split::Split;
+
+/// A photo capture, whole in memory: every photo with its camera, the sparse points, and which views are held out.
+#[derive(Debug, Clone)]
+pub struct Capture {
+    /// Name of the capture's folder.
+    pub name: String,
+    /// The folder that was read.
+    pub root: PathBuf,
+    /// The folder of the photos.
+    pub photos: PathBuf,
+    /// All views, sorted by [`View::name`]. Never empty.
+    pub views: Vec<View>,
+    /// Points of structure from motion, in file order. Never empty.
+    pub points: Vec<Point>,
+    /// Indices into [`Capture::views`]: to train on, and held out.
+    pub split: Split,
+    /// What is odd about the capture but did not prevent reading it.
+    pub warnings: Vec<CaptureWarning>,
+}
+
+/// One photo and the pinhole camera that took it.
+#[derive(Debug, Clone)]
+pub struct View {
+    /// Name of the photo as the capture gives it, relative to the folder of the photos.
+    pub name: String,
+    /// Width of `image` in pixels.
+    pub width: u32,
+    /// Height of `image` in pixels.
+    pub height: u32,
+    /// `[fx, fy, cx, cy]` in pixels of `image`; the centre of pixel (i, j) is at (i + 0.5, j + 0.5).
+    pub intrinsics: [f64; 4],
+    /// World to camera, row-major 4x4, last row `0 0 0 1`.
+    pub viewmat: [[f64; 4]; 4],
+    /// 8-bit RGB, row by row from the top: `3 * width * height` bytes. Shared, so that a view is cheap to clone.
+    pub image: Arc<Vec<u8>>,
+}
+
+/// A point of structure from motion.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Point {
+    /// World position.
+    pub position: [f64; 3],
+    /// 8-bit RGB.
+    pub color: [u8; 3],
+}
+
+/// How to read a capture.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct CaptureOptions {
+    /// Area-average every photo by this factor, at least 1 (1: as it is). Default 1.
+    pub downscale: u32,
+    /// Folder of the photos, relative to the capture's or absolute. Default: `images`, or the capture's own folder where
+    /// there is no `images`.
+    pub images: Option<PathBuf>,
+}
+
+impl Default for CaptureOptions {
+    fn default() -> Self {
+        Self {
+            downscale: 1,
+            images: None,
+        }
+    }
+}
+
+impl Capture {
+    /// Reads the capture in the folder `root`.
+    ///
+    /// The COLMAP model is looked for in `sparse/0`, then `sparse`, then `root` itself, binary before text; the
+    /// photos in [`CaptureOptions::images`]. Cameras must be `PINHOLE` or `SIMPLE_PINHOLE`. Photos are decoded in
+    /// parallel; where a photo's size is a uniform rescale of its camera's, the intrinsics follow the photo and a
+    /// warning says so. A photo of which a part is missing is refused. The held-out views are those `split.json`
+    /// names, or else every 8th by name from the first.
+    ///
+    /// Reading the model takes less than 32 times the memory of its files, a JPEG file 64 times (while it is read);
+    /// the pixels of the photos come on top, three bytes each, and up to twelve while a photo is decoded.
+    ///
+    /// # Errors
+    ///
+    /// Whatever makes the capture unusable, see [`CaptureError`]. A capture of a single photo is read: whether there
+    /// is anything to train on is for [`Capture::check_trainable`].
+    pub fn load(root: &Path, options: &CaptureOptions) -> Result<Self, CaptureError> {
+        if options.downscale == 0 {
+            return Err(CaptureError::ZeroDownscale);
+        }
+        let (model, mut warnings) = colmap::read(root)?;
+        let photos = images::folder(root, &model, options)?;
+        let views = images::load(root, &photos, &model, options, &mut warnings)?;
+        let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
+        let split = Split::of_capture(root, &names, &mut warnings)?;
+        Ok(Self {
+            name: folder_name(root),
+            root: root.to_path_buf(),
+            photos,
+            split,
+            points: model.points,
+            views,
+            warnings,
+        })
+    }
+
+    /// Checks that there is at least one view to train on.
+    ///
+    /// # Errors
+    ///
+    /// [`CaptureError::NothingToTrainOn`], which is what the usual split leaves of a single photo.
+    pub fn check_trainable(&self) -> Result<(), CaptureError> {
+        if self.split.train.is_empty() {
+            return Err(CaptureError::NothingToTrainOn {
+                root: self.root.clone(),
+                photos: self.views.len(),
+            });
+        }
+        Ok(())
+    }
+
+    /// The files of the photos, in the order of the views.
+    pub fn photo_files(&self) -> Vec<PathBuf> {
+        let file = |view: &View| self.photos.join(&view.name);
+        self.views.iter().map(file).collect()
+    }
+
+    /// The views to train on, in the order of their names.
+    pub fn train_views(&self) -> impl ExactSizeIterator<Item = &View> {
+        self.split.train.iter().map(|&index| &self.views[index])
+    }
+
+    /// The held-out views, in the order of their names.
+    pub fn test_views(&self) -> impl ExactSizeIterator<Item = &View> {
+        self.split.test.iter().map(|&index| &self.views[index])
+    }
+
+    /// Number of photos of each size, `(width, height, count)`, the most frequent first.
+    pub fn image_sizes(&self) -> Vec<(u32, u32, usize)> {
+        let mut counts = HashMap::new();
+        for view in &self.views {
+            *counts.entry((view.width, view.height)).or_insert(0) += 1;
+        }
+        let mut sizes: Vec<_> = counts
+            .into_iter()
+            .map(|((width, height), count)| (width, height, count))
+            .collect();
+        sizes.sort_by_key(|&(width, height, count)| (std::cmp::Reverse(count), width, height));
+        sizes
+    }
+}
+
+impl View {
+    /// Its camera.
+    pub fn camera(&self) -> Camera {
+        let [r0, r1, r2, r3] = self.viewmat.map(DVec4::from_array);
+        Camera {
+            viewmat: DMat4::from_cols(r0, r1, r2, r3).transpose(),
+            intrinsics: self.intrinsics,
+            size: ImageSize {
+                width: self.width,
+                height: self.height,
+            },
+        }
+    }
+
+    /// The view with its photo area-averaged by `factor`, as [`CaptureOptions::downscale`] has it, or by the largest power
+    /// of two below it that leaves both sides at least as long as SSIM's window.
+    pub fn downscaled(&self, factor: u32) -> Self {
+        let mut factor = factor;
+        let shorter = self.width.min(self.height);
+        while factor > 1 && shorter / factor < images::MIN_SIDE {
+            factor = if factor.is_power_of_two() {
+                factor / 2
+            } else {
+                factor.next_power_of_two() / 2
+            };
+        }
+        if factor <= 1 {
+            return self.clone();
+        }
+        let (image, width, height) =
+            downscale::area_average(&self.image, self.width, self.height, factor);
+        Self {
+            name: self.name.clone(),
+            width,
+            height,
+            intrinsics: downscale::intrinsics(self.intrinsics, factor),
+            viewmat: self.viewmat,
+            image: Arc::new(image),
+        }
+    }
+
+    /// Where a world point falls in the photo, `(x, y)` in pixels, and its depth along the camera's axis. Points at
+    /// depth 0 have no finite place.
+    pub fn project(&self, point: [f64; 3]) -> ([f64; 2], f64) {
+        let [x, y, z]: [f64; 3] = std::array::from_fn(|row| {
+            let r = &self.viewmat[row];
+            r[0] * point[0] + r[1] * point[1] + r[2] * point[2] + r[3]
+        });
+        let [fx, fy, cx, cy] = self.intrinsics;
+        ([fx * x / z + cx, fy * y / z + cy], z)
+    }
+}
+
+/// Last component of the folder's path, also for `.` and `..`.
+fn folder_name(root: &Path) -> String {
+    let name = |path: &Path| Some(path.file_name()?.to_string_lossy().into_owned());
+    name(root)
+        .or_else(|| name(&root.canonicalize().ok()?))
+        .unwrap_or_else(|| "capture".to_owned())
+}
+
+#[cfg(test)]
+mod photo_tests;
+#[cfg(test)]
+mod test_capture;
+#[cfg(test)]
+mod tests;

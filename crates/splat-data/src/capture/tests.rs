@@ -1,0 +1,617 @@
+//! What the readers promise: both encodings are one model, the geometry is kept, and bad input is an error that names
+//! the file, never a panic.
+
+use std::path::{Path, PathBuf};
+
+use tempfile::TempDir;
+
+use super::test_capture::{SIZES, TestCapture};
+use super::*;
+
+/// A good binary capture in a folder of its own.
+fn good() -> (TempDir, TestCapture) {
+    let root = TempDir::new().unwrap();
+    let capture = TestCapture::new();
+    capture.write_photos(root.path());
+    capture.write_binary(&root.path().join("sparse/0"));
+    (root, capture)
+}
+
+fn load(root: &Path) -> Result<Capture, CaptureError> {
+    Capture::load(root, &CaptureOptions::default())
+}
+
+/// The error of loading `root`, which must be one line and name `file`.
+fn error_of(root: &Path, file: &str) -> CaptureError {
+    let error = load(root).expect_err("the capture is bad");
+    let message = error.to_string();
+    assert!(message.contains(file), "`{message}` does not name {file}");
+    assert!(!message.contains('\n'), "`{message}` is not one line");
+    error
+}
+
+/// The example that ships with the project.
+fn example() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov")
+}
+
+#[test]
+fn text_and_binary_are_the_same_model() {
+    let root = TempDir::new().unwrap();
+    let model = TestCapture::new();
+    model.write_binary(&root.path().join("sparse/0"));
+    let (binary, _) = colmap::read(root.path()).unwrap();
+    std::fs::remove_dir_all(root.path().join("sparse")).unwrap();
+    model.write_text(&root.path().join("sparse"));
+    let (text, _) = colmap::read(root.path()).unwrap();
+    assert_eq!(binary, text);
+
+    assert_eq!(binary.images.len(), 9);
+    assert_eq!(binary.images[0].name, "view r.png");
+    assert_eq!(binary.images[0].id, 92);
+    assert_eq!(binary.images[0].camera_id, 7);
+    assert_eq!(binary.cameras[&2].intrinsics, [33.0, 33.0, 12.0, 15.0]);
+    assert_eq!(binary.points[3].color, [3, 255, 30]);
+    assert_eq!(binary.points[3].position, [1.0, -3e-7, 1e6 - 3.0]);
+}
+
+#[test]
+fn the_example_is_the_same_as_text() {
+    let (binary, _) = colmap::read(&example()).unwrap();
+    let parameters = |camera: &colmap::Camera| camera.intrinsics.to_vec();
+    let text = TestCapture {
+        cameras: binary
+            .cameras
+            .values()
+            .map(|c| (c.id, 1, c.width.into(), c.height.into(), parameters(c)))
+            .collect(),
+        images: binary
+            .images
+            .iter()
+            .map(|i| {
+                (
+                    i.id,
+                    i.quaternion,
+                    i.translation,
+                    i.camera_id,
+                    i.name.clone(),
+                )
+            })
+            .collect(),
+        points: (0..).zip(binary.points.iter().copied()).collect(),
+    };
+    let root = TempDir::new().unwrap();
+    text.write_text(&root.path().join("sparse/0"));
+    let (text, _) = colmap::read(root.path()).unwrap();
+    assert_eq!(binary, text);
+}
+
+#[test]
+fn the_example_sees_its_points() {
+    let capture = load(&example()).unwrap();
+    assert_eq!(capture.name, "saharov");
+    assert_eq!((capture.views.len(), capture.split.test.len()), (32, 4));
+    assert_eq!(capture.warnings, []);
+    let count = capture.points.len();
+    for view in &capture.views {
+        assert_eq!(
+            view.image.len(),
+            3 * view.width as usize * view.height as usize
+        );
+        let inside = |point: &&Point| {
+            let ([x, y], depth) = view.project(point.position);
+            let (w, h) = (f64::from(view.width), f64::from(view.height));
+            depth > 0.0 && (0.0..w).contains(&x) && (0.0..h).contains(&y)
+        };
+        let seen = capture.points.iter().filter(inside).count();
+        assert!(
+            seen > count / 2,
+            "{} sees {seen} of {count} points",
+            view.name
+        );
+    }
+}
+
+#[test]
+fn quaternions_are_normalised_and_poses_kept() {
+    let (root, capture) = good();
+    let views = load(root.path()).unwrap().views;
+    for view in &views {
+        let m = view.viewmat;
+        let dot = |a: usize, b: usize| (0..3).map(|i| m[a][i] * m[b][i]).sum::<f64>();
+        for (a, b) in [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)] {
+            let expected = f64::from(u8::from(a == b));
+            assert!((dot(a, b) - expected).abs() < 1e-15);
+        }
+        let (_, _, translation, _, _) = capture
+            .images
+            .iter()
+            .find(|image| image.4 == view.name)
+            .unwrap();
+        assert_eq!([m[0][3], m[1][3], m[2][3]], *translation);
+        // The centre is what the camera maps to its origin.
+        let center = view.camera().position().to_array();
+        for row in &m[..3] {
+            let mapped = row[0] * center[0] + row[1] * center[1] + row[2] * center[2] + row[3];
+            assert!(mapped.abs() < 1e-14);
+        }
+    }
+    // A turn about y by twice 0.3, as COLMAP's rotation matrix has it.
+    let second = views.iter().find(|view| view.name == "view y.png").unwrap();
+    assert!((second.viewmat[0][2] - 0.6f64.sin()).abs() < 1e-15);
+    assert!((second.viewmat[2][0] + 0.6f64.sin()).abs() < 1e-15);
+}
+
+#[test]
+fn photos_are_kept_as_they_are() {
+    let (root, _) = good();
+    let capture = load(root.path()).unwrap();
+    assert_eq!(capture.warnings, []);
+    let view = &capture.views[0];
+    assert_eq!([view.width, view.height], SIZES[0]);
+    // Pixel (x, y) was written as (x, y, id).
+    let at = 3 * (5 * view.width as usize + 9);
+    assert_eq!(view.image[at..at + 3], [9, 5, 92]);
+}
+
+#[test]
+fn every_eighth_view_is_held_out() {
+    let (root, _) = good();
+    let split = load(root.path()).unwrap().split;
+    assert_eq!(split.test, [0, 8]);
+    assert_eq!(split.train, [1, 2, 3, 4, 5, 6, 7]);
+}
+
+#[test]
+fn a_named_split_is_followed() {
+    let (root, _) = good();
+    let path = root.path().join("split.json");
+    let json = r#"{"rule": "mine", "train": ["view z.png", "view s.png"], "test": ["view y.png", "gone.png"]}"#;
+    std::fs::write(&path, json).unwrap();
+    let capture = load(root.path()).unwrap();
+    let names = |indices: &[usize]| -> Vec<String> {
+        let name = |&i: &usize| capture.views[i].name.clone();
+        indices.iter().map(name).collect()
+    };
+    assert_eq!(names(&capture.split.train), ["view s.png", "view z.png"]);
+    assert_eq!(names(&capture.split.test), ["view y.png"]);
+    assert_eq!(
+        capture.warnings,
+        [
+            CaptureWarning::SplitNamesUnknown {
+                count: 1,
+                first: "gone.png".into()
+            },
+            CaptureWarning::SplitLeavesOut {
+                count: 6,
+                first: "view r.png".into()
+            },
+        ]
+    );
+
+    std::fs::write(
+        &path,
+        r#"{"train": ["view z.png"], "test": ["view z.png"]}"#,
+    )
+    .unwrap();
+    assert!(
+        error_of(root.path(), "split.json")
+            .to_string()
+            .contains("view z.png")
+    );
+    std::fs::write(&path, "[]").unwrap();
+    error_of(root.path(), "split.json");
+
+    // As editors on Windows leave it.
+    let marked = format!("\u{feff}{}", json.replace(", ", ",\r\n"));
+    std::fs::write(&path, marked).unwrap();
+    assert_eq!(load(root.path()).unwrap().split, capture.split);
+    let utf16: Vec<u8> = json.encode_utf16().flat_map(u16::to_le_bytes).collect();
+    std::fs::write(&path, utf16).unwrap();
+    assert!(
+        error_of(root.path(), "split.json")
+            .to_string()
+            .contains("UTF-16")
+    );
+}
+
+#[test]
+fn downscale_averages_areas_and_divides_intrinsics() {
+    let (root, _) = good();
+    let full = load(root.path()).unwrap();
+    let half = Capture::load(
+        root.path(),
+        &CaptureOptions {
+            downscale: 2,
+            ..CaptureOptions::default()
+        },
+    )
+    .unwrap();
+    for (full, half) in full.views.iter().zip(&half.views) {
+        assert_eq!([half.width, half.height], [full.width / 2, full.height / 2]);
+        assert_eq!(half.intrinsics, full.intrinsics.map(|value| value / 2.0));
+        let w = full.width as usize;
+        let [x, y] = [6, 3];
+        for channel in 0..3 {
+            let value =
+                |dx, dy| f64::from(full.image[3 * ((2 * y + dy) * w + 2 * x + dx) + channel]);
+            let mean = (value(0, 0) + value(1, 0) + value(0, 1) + value(1, 1)) / 4.0;
+            let got = half.image[3 * (y * half.width as usize + x) + channel];
+            assert_eq!(f64::from(got), mean.round());
+        }
+    }
+
+    // What does not fill a block is dropped: 7 x 5 by 3 is 2 x 1.
+    let image: Vec<u8> = (0..7 * 5).flat_map(|i| [i, 0, 255]).collect();
+    let (pixels, w, h) = downscale::area_average(&image, 7, 5, 3);
+    assert_eq!((w, h), (2, 1));
+    assert_eq!(pixels, [8, 0, 255, 11, 0, 255]);
+
+    let none = CaptureOptions {
+        downscale: 0,
+        ..CaptureOptions::default()
+    };
+    assert!(matches!(
+        Capture::load(root.path(), &none),
+        Err(CaptureError::ZeroDownscale)
+    ));
+    let much = CaptureOptions {
+        downscale: 3,
+        ..CaptureOptions::default()
+    };
+    let error = Capture::load(root.path(), &much).unwrap_err();
+    assert!(matches!(error, CaptureError::PhotoTooSmall { .. }));
+}
+
+#[test]
+fn rescaled_photos_take_their_intrinsics_along() {
+    let (root, _) = good();
+    let name = "view r.png";
+    let path = root.path().join("images").join(name);
+    // 32 x 24 by 0.7 is 22.4 x 16.8.
+    image::RgbImage::new(22, 17).save(&path).unwrap();
+    let capture = load(root.path()).unwrap();
+    let view = &capture.views[0];
+    let (sx, sy) = (22.0 / 32.0, 17.0 / 24.0);
+    assert_eq!(
+        view.intrinsics,
+        [40.5 * sx, 41.25 * sy, 15.75 * sx, 12.5 * sy]
+    );
+    let [warning] = &capture.warnings[..] else {
+        panic!("one warning, not {:?}", capture.warnings);
+    };
+    assert!(warning.to_string().contains(name));
+
+    // Another shape is no rescale.
+    for (w, h, word) in [(22, 22, "uniform"), (24, 32, "rotated"), (1, 1, "11x11")] {
+        image::RgbImage::new(w, h).save(&path).unwrap();
+        assert!(error_of(root.path(), name).to_string().contains(word));
+    }
+}
+
+#[test]
+fn transparent_pixels_are_put_on_black() {
+    let (root, _) = good();
+    let pixel = |x: u32, _| image::Rgba([200, 100, 50, if x == 0 { 128 } else { 255 }]);
+    image::RgbaImage::from_fn(32, 24, pixel)
+        .save(root.path().join("images/view r.png"))
+        .unwrap();
+    let capture = load(root.path()).unwrap();
+    assert_eq!(capture.views[0].image[..6], [100, 50, 25, 200, 100, 50]);
+    let [CaptureWarning::TransparentPhotos { count: 1, .. }] = capture.warnings[..] else {
+        panic!("a warning, not {:?}", capture.warnings);
+    };
+}
+
+#[test]
+fn files_that_are_not_needed_do_no_harm() {
+    let (root, _) = good();
+    for file in ["rigs.bin", "frames.bin", "project.ini"] {
+        std::fs::write(root.path().join("sparse/0").join(file), b"anything").unwrap();
+    }
+    std::fs::write(root.path().join("images/extra.JPG"), b"no photo").unwrap();
+    std::fs::create_dir(root.path().join("sparse/1")).unwrap();
+    std::fs::write(root.path().join("sparse/1/cameras.bin"), b"").unwrap();
+    let warnings = load(root.path()).unwrap().warnings;
+    assert!(matches!(
+        &warnings[..],
+        [
+            CaptureWarning::OtherModels { others: 1, .. },
+            CaptureWarning::UnregisteredPhotos { count: 1, first }
+        ] if first == "extra.JPG"
+    ));
+}
+
+#[test]
+fn what_follows_the_last_record_is_an_error() {
+    let (root, model) = good();
+    let folder = root.path().join("sparse/0");
+    for (file, bytes, count) in [
+        ("cameras.bin", model.cameras_bin(), "2 cameras"),
+        ("images.bin", model.images_bin(), "9 images"),
+        ("points3D.bin", model.points_bin(), "5 points"),
+    ] {
+        for more in [&[0][..], b"0123456"] {
+            std::fs::write(folder.join(file), [&bytes, more].concat()).unwrap();
+            let message = error_of(root.path(), file).to_string();
+            let bytes = format!("{} bytes", more.len());
+            assert!(
+                message.contains(&bytes) && message.contains(count),
+                "{message}"
+            );
+        }
+        std::fs::write(folder.join(file), bytes).unwrap();
+    }
+    load(root.path()).unwrap();
+}
+
+#[test]
+fn a_wrong_count_is_told() {
+    let (root, model) = good();
+    let folder = root.path().join("sparse/0");
+    std::fs::remove_dir_all(&folder).unwrap();
+    model.write_text(&folder);
+    assert_eq!(load(root.path()).unwrap().warnings, []);
+    let counts = [("cameras", 2, 3), ("images", 9, 15), ("points3D", 5, 4)];
+    for (stem, read, announced) in counts {
+        let path = folder.join(format!("{stem}.txt"));
+        let text = std::fs::read_to_string(&path).unwrap();
+        let what = stem.trim_end_matches("3D");
+        for count in [read, announced] {
+            let head = format!("\u{feff}# Number of {what}: {count}, mean of something: 2.5\r\n");
+            std::fs::write(&path, head + &text).unwrap();
+            let warnings = load(root.path()).unwrap().warnings;
+            let messages: Vec<String> = warnings.iter().map(ToString::to_string).collect();
+            assert_eq!(messages.len(), usize::from(count != read), "{messages:?}");
+            for message in messages {
+                let says = |word: &str| assert!(message.contains(word), "{message}");
+                says(&format!("{stem}.txt"));
+                says(&format!("{announced} {what}"));
+                says(&format!("lists {read}"));
+            }
+        }
+        std::fs::write(&path, text).unwrap();
+    }
+}
+
+#[test]
+fn every_truncation_is_an_error() {
+    let (root, model) = good();
+    let files = [
+        ("cameras.bin", model.cameras_bin()),
+        ("images.bin", model.images_bin()),
+        ("points3D.bin", model.points_bin()),
+    ];
+    for (file, bytes) in &files {
+        let path = root.path().join("sparse/0").join(file);
+        for end in 0..bytes.len() {
+            std::fs::write(&path, &bytes[..end]).unwrap();
+            let error = error_of(root.path(), file);
+            assert!(
+                matches!(
+                    error,
+                    CaptureError::Truncated { .. } | CaptureError::ImpossibleCount { .. }
+                ),
+                "{file} cut at {end}: {error}"
+            );
+        }
+        std::fs::write(&path, bytes).unwrap();
+    }
+    load(root.path()).unwrap();
+}
+
+#[test]
+fn garbage_is_an_error() {
+    let (root, model) = good();
+    let good_files = [
+        ("cameras.bin", model.cameras_bin()),
+        ("images.bin", model.images_bin()),
+        ("points3D.bin", model.points_bin()),
+    ];
+    for (file, bytes) in &good_files {
+        let path = root.path().join("sparse/0").join(file);
+        // A count that would need more memory than there is, and noise.
+        let mut huge = bytes.clone();
+        huge[..8].fill(0xff);
+        let mut state = 1u32;
+        let noise: Vec<u8> = (0..999)
+            .map(|_| {
+                state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
+                (state >> 24) as u8
+            })
+            .collect();
+        for bad in [huge, noise] {
+            std::fs::write(&path, bad).unwrap();
+            error_of(root.path(), file);
+        }
+        std::fs::write(&path, bytes).unwrap();
+    }
+}
+
+#[test]
+fn other_camera_models_are_named() {
+    let (root, mut model) = good();
+    for (number, name) in [(4, "OPENCV"), (2, "SIMPLE_RADIAL"), (99, "number 99")] {
+        model.cameras[1].1 = number;
+        model.write_binary(&root.path().join("sparse/0"));
+        let error = error_of(root.path(), "cameras.bin");
+        assert!(matches!(
+            &error,
+            CaptureError::UnsupportedCamera { camera_id: 2, model, .. } if model == name
+        ));
+        assert!(error.to_string().contains(name));
+    }
+    model.cameras[1].1 = 4;
+    std::fs::remove_dir_all(root.path().join("sparse")).unwrap();
+    model.write_text(&root.path().join("sparse/0"));
+    let message = error_of(root.path(), "cameras.txt").to_string();
+    assert!(message.contains("camera 2") && message.contains("OPENCV"));
+}
+
+/// Spoils one thing in the good model and returns the message of the error, which must name `file`.
+fn message_after(file: &str, spoil: impl FnOnce(&mut TestCapture)) -> String {
+    let (root, mut model) = good();
+    spoil(&mut model);
+    model.write_binary(&root.path().join("sparse/0"));
+    error_of(root.path(), file).to_string()
+}
+
+#[test]
+fn nonsense_in_a_record_is_named() {
+    type Case = (&'static str, &'static str, fn(&mut TestCapture));
+    let cases: [Case; 13] = [
+        ("points3D.bin", "point 3", |m| {
+            m.points[3].1.position[1] = f64::INFINITY;
+        }),
+        ("points3D.bin", "no point", |m| m.points.clear()),
+        ("images.bin", "no image", |m| m.images.clear()),
+        ("images.bin", "image 98", |m| m.images[2].2[0] = f64::NAN),
+        ("images.bin", "image 98", |m| m.images[2].1[3] = f64::NAN),
+        ("images.bin", "image 98", |m| m.images[2].1 = [0.0; 4]),
+        ("images.bin", "camera 55", |m| m.images[2].3 = 55),
+        ("images.bin", "twice", |m| {
+            m.images[2].4 = m.images[1].4.clone();
+        }),
+        ("images.bin", r"a\nb", |m| m.images[2].4 = "a\nb".into()),
+        ("cameras.bin", "twice", |m| m.cameras[1].0 = 7),
+        ("cameras.bin", "camera 7", |m| m.cameras[0].2 = 0),
+        ("cameras.bin", "height", |m| m.cameras[0].3 = u64::MAX),
+        ("cameras.bin", "fx NaN", |m| m.cameras[0].4[0] = f64::NAN),
+    ];
+    for (file, word, spoil) in cases {
+        let message = message_after(file, spoil);
+        assert!(message.contains(word), "`{message}` does not say `{word}`");
+    }
+}
+
+#[test]
+fn bad_text_names_the_line() {
+    let root = TempDir::new().unwrap();
+    let folder = root.path().join("sparse/0");
+    let model = TestCapture::new();
+    let cases = [
+        (
+            "cameras.txt",
+            "7 PINHOLE 32 24 40.5 41.25 15.75\n",
+            "line 1",
+        ),
+        ("cameras.txt", "# hi\n7 PINHOLE 32 -24 1 1 1 1\n", "line 2"),
+        ("images.txt", "1 1 0 0 0 0 0 x 7 a.png\n\n", "line 1"),
+        ("images.txt", "1 1 0 0 0 0 0 0 7 \n\n", "name"),
+        ("points3D.txt", "1 0 0 0 1 2 300 0.5\n", "colour"),
+        ("points3D.txt", "# nothing\n", "no point"),
+    ];
+    for (file, text, word) in cases {
+        model.write_text(&folder);
+        std::fs::write(folder.join(file), text).unwrap();
+        let message = error_of(root.path(), file).to_string();
+        assert!(message.contains(word), "`{message}` does not say `{word}`");
+    }
+}
+
+#[test]
+fn missing_files_are_named() {
+    let (root, _) = good();
+    std::fs::remove_file(root.path().join("images/view u.png")).unwrap();
+    let error = error_of(root.path(), "view u.png");
+    assert!(matches!(error, CaptureError::MissingPhoto { .. }));
+
+    std::fs::write(root.path().join("images/view u.png"), b"no photo").unwrap();
+    let error = error_of(root.path(), "view u.png");
+    assert!(matches!(error, CaptureError::UndecodablePhoto { .. }));
+
+    std::fs::remove_file(root.path().join("sparse/0/images.bin")).unwrap();
+    let error = error_of(root.path(), "images.bin");
+    assert!(matches!(error, CaptureError::MissingModelFile { .. }));
+
+    std::fs::remove_dir_all(root.path().join("sparse")).unwrap();
+    let folder = root.path().to_string_lossy().into_owned();
+    assert!(matches!(
+        error_of(root.path(), &folder),
+        CaptureError::NoModel { hint: "", .. }
+    ));
+    std::fs::write(root.path().join("transforms.json"), b"{}").unwrap();
+    error_of(root.path(), "nerfstudio");
+
+    let file = root.path().join("transforms.json");
+    assert!(matches!(
+        error_of(&file, "transforms.json"),
+        CaptureError::NotAFolder { .. }
+    ));
+    let absent = root.path().join("absent");
+    assert!(matches!(
+        error_of(&absent, "absent"),
+        CaptureError::Io { .. }
+    ));
+}
+
+#[test]
+fn one_photo_can_be_looked_at_but_not_trained_on() {
+    let (root, mut model) = good();
+    model.images.truncate(1);
+    model.write_binary(&root.path().join("sparse/0"));
+    let capture = load(root.path()).unwrap();
+    let message = capture.check_trainable().unwrap_err().to_string();
+    assert!(message.contains("at least 2"), "{message}");
+
+    // Unless the capture says that it is to be trained on.
+    let split = format!(r#"{{"train": ["{}"], "test": []}}"#, model.images[0].4);
+    std::fs::write(root.path().join("split.json"), split).unwrap();
+    load(root.path()).unwrap().check_trainable().unwrap();
+}
+
+/// A photo is read from the folder of photos, wherever the model says that it lies.
+#[test]
+fn a_name_that_leads_out_of_the_folder_is_refused() {
+    for name in [
+        "../secret.png",
+        "a/../../secret.png",
+        "/etc/passwd",
+        "C:\\photo.png",
+        "..\\secret.png",
+    ] {
+        let message = message_after("images.bin", |model| model.images[3].4 = name.into());
+        assert!(message.contains("image 97"), "{message}");
+        assert!(message.contains("leads out of the folder"), "{message}");
+    }
+    // Dots in a name are only dots.
+    let (root, mut model) = good();
+    model.images[3].4 = "a..b...png".into();
+    model.write_photos(root.path());
+    model.write_binary(&root.path().join("sparse/0"));
+    assert_eq!(load(root.path()).unwrap().views[0].name, "a..b...png");
+}
+
+/// The second one took the place of the first.
+#[test]
+fn two_cameras_of_one_id_are_refused() {
+    let message = message_after("cameras.bin", |model| model.cameras[1].0 = 7);
+    assert!(
+        message.contains("camera 7: its id occurs twice"),
+        "{message}"
+    );
+}
+
+/// Squares of such components vanish or overflow, in part or all of them.
+#[test]
+fn quaternions_of_any_length_are_normalised() {
+    let viewmat = |length: f64| {
+        let (root, mut model) = good();
+        for image in &mut model.images {
+            image.1 = [0.5, -0.1, 0.7, 0.3].map(|q| q * length);
+        }
+        model.write_binary(&root.path().join("sparse/0"));
+        load(root.path()).unwrap().views[0].viewmat
+    };
+    let expected = viewmat(1.0);
+    for length in [1e-300, 1e-161, 1e-158, 1e160, 1e300] {
+        for (row, expected) in viewmat(length).iter().zip(&expected) {
+            for (value, expected) in row.iter().zip(expected) {
+                assert!(
+                    (value - expected).abs() < 1e-15,
+                    "{length}: {value} {expected}"
+                );
+            }
+        }
+    }
+}

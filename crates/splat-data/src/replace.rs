@@ -1,0 +1,257 @@
+//! Files that are written whole or not at all, and whether a place can be written to, asked before long work.
+
+use std::io::{Error, ErrorKind, Write};
+use std::path::{Path, PathBuf};
+
+/// Why a file or a folder cannot be written.
+#[derive(Debug, thiserror::Error)]
+#[error("{}: {source}", path.display())]
+pub struct WriteError {
+    /// The file or folder.
+    pub path: PathBuf,
+    /// What the system said.
+    pub source: Error,
+}
+
+/// Replaces the file `path` by `contents`; folders on the way are made. After a crash of the machine it may be empty:
+/// for what can be made again. A device or a pipe is written to.
+///
+/// # Errors
+///
+/// Whatever the system says; the old file, if there was one, is then untouched.
+pub fn write_atomically(path: &Path, contents: &[u8]) -> std::io::Result<()> {
+    replace(path, contents, false)
+}
+
+/// [`write_atomically`] for what cannot be made again. The disk has the new file before it loses the old one, so that
+/// also a crash of the machine leaves one of them. The price is to wait for the disk: measured on that of a virtual
+/// machine, 1 to 5 ms for a small file, 0.16 s for 100 MB, 1.6 s for 500 MB (the checkpoint of 700,000 Gaussians).
+///
+/// # Errors
+///
+/// As those of [`write_atomically`].
+pub fn write_durably(path: &Path, contents: &[u8]) -> std::io::Result<()> {
+    replace(path, contents, true)
+}
+
+fn replace(path: &Path, contents: &[u8], durably: bool) -> std::io::Result<()> {
+    if is_device(path) {
+        return std::fs::OpenOptions::new()
+            .write(true)
+            .open(path)?
+            .write_all(contents);
+    }
+    // The file that a link points to, not the link.
+    let linked = path
+        .is_symlink()
+        .then(|| path.canonicalize().ok())
+        .flatten();
+    let path = linked.as_deref().unwrap_or(path);
+    let folder = folder_of(path);
+    std::fs::create_dir_all(folder)?;
+    // On the same file system as its place, so that the rename is one step.
+    let file = temporary_file(folder)?;
+    file.as_file().write_all(contents)?;
+    if durably {
+        file.as_file().sync_all()?;
+    }
+    file.persist(path)?;
+    if durably {
+        sync_folder(folder);
+    }
+    Ok(())
+}
+
+/// Tries whether files can be written to `folder`, which is made if need be: with a file that is removed again.
+///
+/// # Errors
+///
+/// [`WriteError`], naming the folder.
+pub fn probe_folder(folder: &Path) -> Result<(), WriteError> {
+    let tried = || -> std::io::Result<()> {
+        std::fs::create_dir_all(folder)?;
+        let file = temporary_file(folder)?;
+        file.as_file().write_all(b"splat")?;
+        file.close()
+    };
+    tried().map_err(|source| WriteError {
+        path: folder.to_path_buf(),
+        source: match source.kind() {
+            // What the system says of a file in a folder's place.
+            ErrorKind::AlreadyExists | ErrorKind::NotADirectory => Error::new(
+                source.kind(),
+                "a file is in the place of a folder to write to",
+            ),
+            _ => source,
+        },
+    })
+}
+
+/// Tries whether the file `path` can be written, without touching it.
+///
+/// # Errors
+///
+/// [`WriteError`], naming the file, or its folder.
+pub fn probe_file(path: &Path) -> Result<(), WriteError> {
+    if is_device(path) {
+        return Ok(());
+    }
+    if path.is_dir() {
+        return Err(WriteError {
+            path: path.to_path_buf(),
+            source: Error::new(
+                ErrorKind::IsADirectory,
+                "a folder is in the place of a file to write; move it away",
+            ),
+        });
+    }
+    probe_folder(folder_of(path))
+}
+
+/// [`probe_file`] of every path that is there.
+///
+/// # Errors
+///
+/// Of the first that cannot be written.
+pub fn probe_files<'a>(
+    paths: impl IntoIterator<Item = &'a Option<PathBuf>>,
+) -> Result<(), WriteError> {
+    paths
+        .into_iter()
+        .flatten()
+        .try_for_each(|path| probe_file(path))
+}
+
+/// Whether this is a pipe, a terminal, or another thing that is written to and never replaced, such as `/dev/stdout`.
+fn is_device(path: &Path) -> bool {
+    let special = |kind: std::fs::Metadata| !kind.is_file() && !kind.is_dir();
+    // What is there may lead to a file, which then is not to be replaced either. `/dev/shm` is a folder like others.
+    let devices = ["/dev", "/dev/fd"].map(|folder| Some(Path::new(folder)));
+    let device = cfg!(unix) && devices.contains(&path.parent()) && path.exists() && !path.is_dir();
+    device || std::fs::metadata(path).is_ok_and(special)
+}
+
+/// The folder of a file.
+fn folder_of(path: &Path) -> &Path {
+    match path.parent() {
+        Some(folder) if !folder.as_os_str().is_empty() => folder,
+        _ => Path::new("."),
+    }
+}
+
+/// A file with a random name, which is removed unless it is renamed.
+fn temporary_file(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {
+    let mut builder = tempfile::Builder::new();
+    readable_by_all(&mut builder);
+    builder.tempfile_in(folder).map_err(|error| {
+        // The random name says nothing to anybody.
+        let text = error.to_string();
+        match text.split_once(" at path \"") {
+            Some((reason, _)) => Error::new(error.kind(), reason.to_owned()),
+            None => error,
+        }
+    })
+}
+
+/// Makes a rename last. Not every system can, and the file is whole without it.
+fn sync_folder(folder: &Path) {
+    if cfg!(unix) {
+        let _ = std::fs::File::open(folder).and_then(|folder| folder.sync_all());
+    }
+}
+
+/// Temporary files are private by default; the file that replaces the old one should not be.
+#[cfg(unix)]
+fn readable_by_all(builder: &mut tempfile::Builder<'_, '_>) {
+    use std::os::unix::fs::PermissionsExt;
+    // The process's umask still applies.
+    builder.permissions(std::fs::Permissions::from_mode(0o666));
+}
+
+#[cfg(not(unix))]
+fn readable_by_all(_: &mut tempfile::Builder<'_, '_>) {}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_failed_write_leaves_nothing_behind() {
+        let folder = tempfile::TempDir::new().unwrap();
+        let path = folder.path().join("new/report.txt");
+        write_atomically(&path, b"old").unwrap();
+        write_atomically(&path, b"new").unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), b"new");
+        write_durably(&path, b"newer").unwrap();
+        assert_eq!(std::fs::read(&path).unwrap(), b"newer");
+
+        // A folder in the file's place cannot be replaced.
+        let blocked = folder.path().join("new");
+        assert!(write_atomically(&blocked, b"half").is_err());
+        assert!(write_durably(&blocked, b"half").is_err());
+        // Neither beside the good file nor beside the blocked one is anything else.
+        assert_eq!(std::fs::read_dir(&blocked).unwrap().count(), 1);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    #[cfg(unix)]
+    fn pipes_are_written_to_and_links_followed() {
+        use std::os::unix::fs::FileTypeExt;
+        let folder = tempfile::TempDir::new().unwrap();
+        let pipe = folder.path().join("pipe");
+        let made = std::process::Command::new("mkfifo").arg(&pipe).status();
+        assert!(made.unwrap().success());
+        probe_file(&pipe).unwrap();
+        let reader = std::thread::spawn({
+            let pipe = pipe.clone();
+            move || {
+                let mut file = std::fs::File::options()
+                    .read(true)
+                    .write(true)
+                    .open(pipe)
+                    .unwrap();
+                let mut read = [0; 5];
+                std::io::Read::read_exact(&mut file, &mut read).unwrap();
+                read
+            }
+        });
+        write_atomically(&pipe, b"bytes").unwrap();
+        let kind = std::fs::symlink_metadata(&pipe).unwrap().file_type();
+        assert!(kind.is_fifo(), "the pipe was replaced by a file");
+        assert_eq!(&reader.join().unwrap(), b"bytes");
+
+        let [file, link] = ["file", "link"].map(|name| folder.path().join(name));
+        std::fs::write(&file, b"old").unwrap();
+        std::os::unix::fs::symlink("file", &link).unwrap();
+        assert!(is_device("/dev/null".as_ref()) && !is_device("/dev/shm".as_ref()));
+        write_atomically(&link, b"new").unwrap();
+        assert!(link.is_symlink());
+        assert_eq!(std::fs::read(&file).unwrap(), b"new");
+    }
+
+    #[test]
+    fn a_place_is_tried_and_left_as_it_was() {
+        let folder = tempfile::TempDir::new().unwrap();
+        let new = folder.path().join("a/b");
+        probe_folder(&new).unwrap();
+        assert_eq!(std::fs::read_dir(&new).unwrap().count(), 0);
+        let file = new.join("file");
+        std::fs::write(&file, b"kept").unwrap();
+        probe_file(&file).unwrap();
+        probe_files([&None, &Some(file.clone())]).unwrap();
+        assert_eq!(std::fs::read(&file).unwrap(), b"kept");
+
+        for (path, named) in [(file.clone(), "file"), (file.join("below"), "below")] {
+            let message = probe_folder(&path).unwrap_err().to_string();
+            assert!(message.contains(named), "{message}");
+            assert!(message.contains("in the place of a folder"), "{message}");
+        }
+        let message = probe_file(&new).unwrap_err().to_string();
+        assert!(
+            message.contains("a/b: a folder is in the place"),
+            "{message}"
+        );
+        assert!(probe_file(&file.join("below")).is_err());
+    }
+}

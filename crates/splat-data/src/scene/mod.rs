@@ -1,0 +1,105 @@
+//! Scene files: trained splats in and out, as plain data ([`SplatData`]) that knows no tensor.
+//!
+//! Today one format: [`ply`], the layout of the 3DGS paper's code, which every viewer reads.
+
+pub mod ply;
+
+mod error;
+
+pub use error::SceneFileError;
+
+use crate::SceneScale;
+
+/// A scene as files hold it: plain arrays, one entry per Gaussian, in the parametrisation that is trained.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SplatData {
+    /// Where in the world the means count from: 0 unless the scene lies far from the world's zero, as in map
+    /// coordinates, where 32-bit floats would round its details away.
+    pub origin: [f64; 3],
+    /// Centres relative to `origin`, `[N][3]`, world units.
+    pub means: Vec<[f32; 3]>,
+    /// Natural logarithm of the scales, `[N][3]`.
+    pub log_scales: Vec<[f32; 3]>,
+    /// Quaternions (w, x, y, z), any non-zero length, `[N][4]`.
+    pub quats: Vec<[f32; 4]>,
+    /// Opacity before the sigmoid, `[N]`.
+    pub opacity_logits: Vec<f32>,
+    /// Coefficient of the constant spherical harmonic, `[N][3]` (RGB).
+    pub sh0: Vec<[f32; 3]>,
+    /// Remaining coefficients, `[N][K - 1][3]` flattened with `K = (sh_degree + 1)^2`: for each Gaussian its
+    /// coefficients in order, each with its three channels.
+    pub sh_rest: Vec<f32>,
+    /// Degree of the spherical harmonics, 0 to 3.
+    pub sh_degree: usize,
+    /// How it must be rendered, as far as that is known.
+    pub settings: SceneSettings,
+}
+
+/// Settings that a scene must be rendered with to look as it did when it was trained. They are part of the scene, and
+/// of its file: `None` where the file does not say.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SceneSettings {
+    /// Size of the scene in world units, which lengths of the renderer count in; positive.
+    pub scene_scale: Option<f64>,
+    /// Whether opacities are multiplied by what the low-pass filter took away.
+    pub antialias: Option<bool>,
+    /// Colour behind the scene, linear RGB; black is zero.
+    pub background: Option<[f32; 3]>,
+    /// What the file says about rendering that this program cannot follow, each in a line; for a warning, and not
+    /// written.
+    pub not_understood: Vec<String>,
+}
+
+impl SplatData {
+    /// Size of the scene: as its settings say, or else as its Gaussians are spread.
+    pub fn scene_scale(&self) -> SceneScale {
+        let said = self.settings.scene_scale.and_then(SceneScale::new);
+        said.unwrap_or_else(|| SceneScale::of_splats(self))
+    }
+
+    /// Number of Gaussians.
+    pub fn len(&self) -> usize {
+        self.means.len()
+    }
+
+    /// True when there is no Gaussian.
+    pub fn is_empty(&self) -> bool {
+        self.means.is_empty()
+    }
+
+    /// Number of values [`SplatData::sh_rest`] holds per Gaussian: `3 ((sh_degree + 1)^2 - 1)`.
+    pub fn sh_rest_len(&self) -> usize {
+        3 * ((self.sh_degree + 1).pow(2) - 1)
+    }
+
+    /// Checks that every array has an entry for each Gaussian and that the degree is at most 3.
+    ///
+    /// # Errors
+    ///
+    /// [`SceneFileError::Shape`], naming the array.
+    pub fn check_shape(&self) -> Result<(), SceneFileError> {
+        let count = self.len();
+        if self.sh_degree > 3 {
+            return Err(SceneFileError::Shape {
+                field: "sh_degree",
+                len: self.sh_degree,
+                expected: 3,
+            });
+        }
+        let lengths = [
+            ("log_scales", self.log_scales.len(), count),
+            ("quats", self.quats.len(), count),
+            ("opacity_logits", self.opacity_logits.len(), count),
+            ("sh0", self.sh0.len(), count),
+            ("sh_rest", self.sh_rest.len(), count * self.sh_rest_len()),
+        ];
+        match lengths.iter().find(|(_, len, expected)| len != expected) {
+            None => Ok(()),
+            Some(&(field, len, expected)) => Err(SceneFileError::Shape {
+                field,
+                len,
+                expected,
+            }),
+        }
+    }
+}

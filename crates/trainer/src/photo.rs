@@ -1,0 +1,24 @@
+//! Photos as tensors.
+
+use burn::tensor::{DType, Device, Int, Tensor, TensorData};
+use splat_data::View;
+
+/// The photo of a view, `[1, H, W, 3]` in [0, 1].
+pub fn photo(view: &View, device: &Device) -> Tensor<4> {
+    values(levels(view, device))
+}
+
+/// The photo of a view as it is stored, 8-bit levels `[1, H, W, 3]`: of type U8 where the device can compute with it.
+pub(crate) fn levels(view: &View, device: &Device) -> Tensor<4, Int> {
+    let dtype = match device.supports_dtype(DType::U8) {
+        true => DType::U8,
+        false => DType::I32,
+    };
+    let shape = [1, view.height as usize, view.width as usize, 3];
+    Tensor::from_data(TensorData::new(view.image.to_vec(), shape), (device, dtype))
+}
+
+/// Levels from 0 to 255 as values in [0, 1].
+pub(crate) fn values(levels: Tensor<4, Int>) -> Tensor<4> {
+    levels.float() / 255.0
+}
