@@ -19,7 +19,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let folder = arguments.next().unwrap_or("examples/data/saharov".into());
     let steps = arguments.next().map_or(Ok(300), |steps| steps.parse())?;
     let capture = Capture::load(
-        folder.as_ref(),
+        folder,
         &CaptureOptions {
             downscale: 2,
             ..CaptureOptions::default()
@@ -37,8 +37,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             let along = |axis| edges(rendered.image(), axis) - edges(view.image(), axis);
             Ok(charbonnier(along(1)) + charbonnier(along(2)))
         });
-    let trained = Trainer::builder()
-        .capture(capture.clone())
+    let trained = Trainer::builder(capture.clone())
         .config(config)
         .device(Device::flex())
         .loss(loss)
@@ -52,7 +51,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         .run()?;
     let views: Vec<_> = capture.test_views().collect();
     let scores = evaluate(
-        &trained.gaussians,
+        &trained.model,
         &views,
         &trained.render_settings,
         &Device::flex(),

@@ -11,8 +11,8 @@
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let device = Device::flex();
-//! let capture = Capture::load("examples/data/saharov".as_ref(), &Default::default())?;
-//! let scene = ply::read("out/scene.ply".as_ref())?;
+//! let capture = Capture::load("examples/data/saharov", &Default::default())?;
+//! let scene = ply::read("out/scene.ply")?;
 //! let gaussians = Gaussians::from_data(&scene, &device);
 //! let camera = CameraTensors::from_camera(&capture.views[0].camera(), &device);
 //! let image = render(&gaussians, &camera, &RenderSettings::of_scene(&scene))?.image(); // [1, H, W, 3]

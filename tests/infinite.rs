@@ -5,12 +5,11 @@
 #[cfg(feature = "wgpu")]
 mod adapter;
 
-use burn::optim::GradientsParams;
 use burn::tensor::{Device, Tensor};
 use burn_splat::data::SplatData;
 use burn_splat::model::{
-    Camera, CameraTensors, Gaussians, LearningRates, RenderSettings, SceneScale, render,
-    splat_optimizer,
+    Camera, CameraTensors, FieldStep, Gaussians, LearningRates, Optimized, RenderSettings,
+    SceneScale, render,
 };
 use burn_splat::ops::{AdamRows, ImageSize};
 
@@ -89,24 +88,25 @@ fn infinities_train() {
     for device in devices() {
         let device = device.autodiff();
         let infinite = scene([f32::INFINITY, f32::NEG_INFINITY, f32::NEG_INFINITY]);
-        let mut gaussians = Gaussians::from_data(&infinite, &device);
-        let unit = SceneScale::new(1.0).unwrap();
-        let (mut optimizer, _) = splat_optimizer(AdamRows::All, unit);
+        let gaussians = Gaussians::from_data(&infinite, &device);
+        let (unit, rates) = (SceneScale::new(1.0).unwrap(), LearningRates::default());
+        let model = Optimized::with_adam(gaussians, &rates, AdamRows::All, unit);
+        let mut model = model.unwrap();
         let target = Tensor::<4>::ones([1, SIZE.height as usize, SIZE.width as usize, 3], &device);
         let losses: Vec<f32> = (0..20)
             .map(|step| {
                 let cameras = cameras(&device);
-                let rendered = render(&gaussians, &cameras, &RenderSettings::default()).unwrap();
+                let rendered = render(model.model(), &cameras, &RenderSettings::default()).unwrap();
                 let loss = (rendered.image() - target.clone()).abs().mean();
-                let grads = GradientsParams::from_grads(loss.backward(), &gaussians);
-                let rates = LearningRates::default().at(step, 20, unit);
-                let model = core::mem::replace(&mut gaussians, Gaussians::empty(&device));
-                gaussians = optimizer.step(rates, model, grads);
+                let gradients = model.gradients(&mut loss.backward());
+                model.step(gradients, |field| {
+                    (field.rate_at(step, 20, unit), FieldStep::Step(1.0))
+                });
                 loss.into_scalar::<f32>()
             })
             .collect();
         assert!(losses[19] < losses[0], "{device:?}: {losses:?}");
-        let after = gaussians.to_data();
+        let after = model.into_model().to_data();
         assert_eq!(after.opacity_logits[1..3], infinite.opacity_logits[1..3]);
         assert_eq!(after.log_scales[4], infinite.log_scales[4]);
         assert_eq!(after.log_scales[3][1], f32::NEG_INFINITY);

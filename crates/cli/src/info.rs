@@ -7,7 +7,6 @@ mod scene;
 use std::path::PathBuf;
 
 use clap::Args;
-use splat_data::scene::ply;
 
 use super::photos::PhotoArgs;
 use super::{Failure, GlobalArgs, print};
@@ -32,7 +31,7 @@ pub(super) fn run(args: &InfoArgs, _: &GlobalArgs) -> Result<(), Failure> {
     let text = if path.is_dir() {
         capture::describe(&Capture::load(path, &args.photos.options())?)
     } else {
-        let scene = ply::read(path)?;
+        let scene = splat_data::scene::read(path)?;
         args.photos.refuse("a scene has no photos")?;
         scene::describe(path, &scene)
     };

@@ -5,7 +5,6 @@ use std::path::Path;
 use burn::tensor::Device;
 use clap::ValueEnum;
 use splat_data::SceneSettings;
-use splat_data::scene::ply;
 use splat_model::{Gaussians, RenderSettings, ShPrecision};
 
 use super::{Failure, GlobalArgs, text};
@@ -29,7 +28,7 @@ pub(super) fn open(
     precision: PrecisionChoice,
     global: &GlobalArgs,
 ) -> Result<(Gaussians, RenderSettings), Failure> {
-    let mut data = ply::read(path)?;
+    let mut data = splat_data::scene::read(path)?;
     for comment in &data.settings.not_understood {
         global.say(format_args!(
             "warning: {}: not followed: comment `{comment}`",

@@ -3,10 +3,8 @@
 mod results;
 mod resume;
 
-use std::cell::RefCell;
 use std::path::{Path, PathBuf};
-use std::rc::Rc;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use clap::{Args, ValueEnum};
@@ -175,9 +173,8 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         checkpoint.as_ref().map_or(0, Checkpoint::step) as u64,
         global.quiet,
     );
-    let progress = Rc::new(RefCell::new(progress));
-    let mut trainer = Trainer::builder()
-        .capture(capture.clone())
+    let progress = Arc::new(Mutex::new(progress));
+    let mut trainer = Trainer::builder(capture.clone())
         .config(config.clone())
         .device(chosen.device.clone())
         .interrupt(interrupt::flag()?)
@@ -206,7 +203,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         ));
     }
     let trained = trainer.run();
-    progress.borrow().finish();
+    lock(&progress).finish();
     let trained = trained.map_err(|error| folder.stopped(error.into()))?;
 
     if trained.steps < config.steps {
@@ -224,7 +221,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     saved?;
     print(&format!(
         "{} Gaussians after {} steps in {:.1} s, in {}\n",
-        trained.gaussians.len(),
+        trained.model.len(),
         trained.steps,
         trained.elapsed.as_secs_f64(),
         out.display()
@@ -232,13 +229,18 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     Ok(())
 }
 
+/// The bar, whatever became of another thread that had it.
+fn lock(progress: &Mutex<Progress>) -> MutexGuard<'_, Progress> {
+    progress.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// Lets progress and warnings be seen.
-fn shown(trainer: TrainerBuilder, progress: &Rc<RefCell<Progress>>) -> TrainerBuilder {
-    let [shown, noted] = [progress, progress].map(Rc::clone);
+fn shown(trainer: TrainerBuilder, progress: &Arc<Mutex<Progress>>) -> TrainerBuilder {
+    let [shown, noted] = [progress, progress].map(Arc::clone);
     trainer
-        .on_warning(move |warning| noted.borrow().note(&format!("warning: {warning}")))
+        .on_warning(move |warning| lock(&noted).note(&format!("warning: {warning}")))
         .on_progress(move |state| {
-            shown.borrow_mut().update(state.step as u64, || {
+            lock(&shown).update(state.step as u64, || {
                 let loss = state.history.mean_loss(LOSS_WINDOW);
                 let loss = loss.map_or_else(String::new, |loss| format!("loss {loss:.4}  "));
                 format!("{loss}{} Gaussians", state.gaussians)

@@ -64,8 +64,7 @@ fn train_with(capture: &Arc<Capture>, device: &Device, seed: u64, deterministic:
     config.density.grow_gradient = 1e-5;
     // More than such small photos ask for.
     config.density.max_gaussians = Some(10_000);
-    Trainer::builder()
-        .capture(capture.clone())
+    Trainer::builder(capture.clone())
         .config(config)
         .device(device.clone())
         .build()
@@ -76,7 +75,7 @@ fn train_with(capture: &Arc<Capture>, device: &Device, seed: u64, deterministic:
 
 /// Every parameter of every Gaussian and every loss, bit for bit.
 fn bits(trained: &Trained) -> Vec<(&'static str, Vec<u32>)> {
-    let data = trained.gaussians.to_data();
+    let data = trained.model.to_data();
     let losses: Vec<f32> = trained.history.losses.iter().map(|r| r.total).collect();
     [
         ("means", data.means.as_flattened()),

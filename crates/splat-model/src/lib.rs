@@ -1,19 +1,33 @@
 //! Gaussian splat models for Burn: the module, cameras, losses, density control, optimiser. Everything is an ordinary Burn module or a function on tensors.
 
-mod adam;
 mod camera;
-pub mod density;
+mod field;
 mod gaussians;
 mod init;
 pub mod losses;
+mod model;
+mod morton;
+mod optimized;
+#[cfg(all(test, feature = "cpu"))]
+mod optimized_tests;
+pub mod optimizer;
 mod rates;
+mod record;
 mod render;
+mod rows;
+pub mod strategy;
 
-pub use adam::{EditLog, RowEdit, SplatAdam};
 pub use camera::CameraTensors;
+pub use field::{Field, GAUSSIANS};
 pub use gaussians::{Gaussians, ShPrecision};
 pub use init::{InitError, InitSettings, splats_from_points};
-pub use rates::{Field, LearningRates, splat_optimizer};
-pub use render::{RenderSettings, project_gaussians, render, render_projected};
+pub use model::SplatModel;
+pub use optimized::{FieldGradients, FieldStep, Optimized};
+pub use rates::LearningRates;
+pub use record::RecordError;
+pub use render::{
+    RenderSettings, project_gaussians, render, render_projected, render_projected_on,
+};
+pub use rows::{Moments, RowEdit};
 pub use splat_data::{Camera, SceneScale, SplatData};
 pub use splat_ops as ops;

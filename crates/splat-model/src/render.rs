@@ -3,11 +3,11 @@
 use burn::tensor::Tensor;
 use splat_data::SplatData;
 use splat_ops::{
-    ClampGradient, OpError, ProjectSettings, Projected, RasterizeSettings, Rendered,
-    ShColorSettings, project, rasterize,
+    ClampGradient, OpError, ProjectSettings, Projected, RasterizeSettings, Rendered, project,
+    rasterize,
 };
 
-use crate::{CameraTensors, Gaussians};
+use crate::{CameraTensors, SplatModel};
 
 /// How to render.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -46,28 +46,28 @@ impl RenderSettings {
 ///
 /// # Errors
 /// See [`project`] and [`rasterize`].
-pub fn render(
-    gaussians: &Gaussians,
+pub fn render<M: SplatModel>(
+    model: &M,
     cameras: &CameraTensors,
     settings: &RenderSettings,
 ) -> Result<Rendered, OpError> {
-    let projected = project_gaussians(gaussians, cameras, settings)?;
-    render_projected(gaussians, &projected, cameras, settings)
+    let projected = project_gaussians(model, cameras, settings)?;
+    render_projected(model, &projected, cameras, settings)
 }
 
 /// The first half of [`render`]: screen splats.
 ///
 /// # Errors
 /// See [`project`].
-pub fn project_gaussians(
-    gaussians: &Gaussians,
+pub fn project_gaussians<M: SplatModel>(
+    model: &M,
     cameras: &CameraTensors,
     settings: &RenderSettings,
 ) -> Result<Projected, OpError> {
     project(
-        gaussians.means.val(),
-        gaussians.quats.val(),
-        gaussians.scales(),
+        model.means(),
+        model.quats(),
+        model.scales(),
         cameras.viewmats.clone(),
         cameras.intrinsics.clone(),
         cameras.size,
@@ -80,23 +80,33 @@ pub fn project_gaussians(
 ///
 /// # Errors
 /// See [`sh_colors`](splat_ops::sh_colors) and [`rasterize`].
-pub fn render_projected(
-    gaussians: &Gaussians,
+pub fn render_projected<M: SplatModel>(
+    model: &M,
     projected: &Projected,
     cameras: &CameraTensors,
     settings: &RenderSettings,
 ) -> Result<Rendered, OpError> {
-    let shading = ShColorSettings {
-        degree: settings.sh_degree.min(gaussians.sh_degree()),
-        clamp_gradient: settings.clamp_gradient,
-    };
-    let colors = gaussians.colors(cameras.centers(), shading, Some(projected))?;
+    render_projected_on(model, projected, cameras, None, settings)
+}
+
+/// [`render_projected`] in front of a background `[C, 3]`, instead of that of the settings.
+///
+/// # Errors
+/// As those of [`render_projected`], and when the background does not fit.
+pub fn render_projected_on<M: SplatModel>(
+    model: &M,
+    projected: &Projected,
+    cameras: &CameraTensors,
+    background: Option<Tensor<2>>,
+    settings: &RenderSettings,
+) -> Result<Rendered, OpError> {
+    let colors = model.shade(cameras, projected, settings)?;
     let [count, _, _] = colors.dims();
-    let background = settings.background.map(|color| {
-        let color = Tensor::<1>::from_floats(color, &colors.device());
-        color.reshape([1, 3]).repeat_dim(0, count)
+    let background = background.or_else(|| {
+        let color = Tensor::<1>::from_floats(settings.background?, &colors.device());
+        Some(color.reshape([1, 3]).repeat_dim(0, count))
     });
-    let opacities = gaussians.opacities();
+    let opacities = model.opacities();
     if settings.antialias {
         // `-1` and a repeat instead of a broadcast, because N may be 0.
         let opacities = opacities.reshape([1, -1]).repeat_dim(0, count);

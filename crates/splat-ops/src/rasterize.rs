@@ -32,6 +32,22 @@ impl Rendered {
         self.image.get_or_init(cut).clone()
     }
 
+    /// The same alpha with another image of the same size, such as one whose exposure was corrected. A copy.
+    ///
+    /// # Errors
+    /// When the image has another number of cameras, or another height or width.
+    pub fn with_image(&self, image: Tensor<4>) -> Result<Self, OpError> {
+        let [c, height, width, _] = self.packed.dims();
+        let check = Checker::new("Rendered::with_image", "rendered", &self.packed)?;
+        let expected = [Some(c), Some(height), Some(width), None];
+        check.tensor("image", &image, expected, "[C, H, W, D]")?;
+        Ok(Self {
+            packed: Tensor::cat(vec![image, self.alpha()], 3),
+            image: OnceLock::new(),
+            alpha: OnceLock::new(),
+        })
+    }
+
     /// `[C, H, W, 1]`: accumulated opacity, one minus the final transmittance.
     pub fn alpha(&self) -> Tensor<4> {
         let [.., width] = self.packed.dims();

@@ -6,9 +6,12 @@ use splat_data::View;
 use splat_model::losses::{SsimSettings, psnr, ssim};
 use splat_model::ops::OpError;
 use splat_model::ops::device::to_host;
-use splat_model::{CameraTensors, Gaussians, RenderSettings, render};
+use splat_model::{
+    CameraTensors, RenderSettings, SplatModel, project_gaussians, render_projected_on,
+};
 
 use crate::photo::photo;
+use crate::train::{HookView, Hooks, Purpose};
 
 /// Scores of one view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -37,22 +40,28 @@ pub struct Scores {
 ///
 /// # Errors
 /// When an op refuses its input, or the device fails.
-pub fn evaluate(
-    gaussians: &Gaussians,
+pub fn evaluate<M: SplatModel>(
+    model: &M,
     views: &[&View],
     settings: &RenderSettings,
     device: &Device,
+    each: impl FnMut(&View, Vec<f32>),
+) -> Result<Scores, OpError> {
+    evaluate_with(model, views, settings, device, &Hooks::default(), each)
+}
+
+/// [`evaluate`] with the hooks of a run.
+pub(crate) fn evaluate_with<M: SplatModel>(
+    model: &M,
+    views: &[&View],
+    settings: &RenderSettings,
+    device: &Device,
+    hooks: &Hooks,
     mut each: impl FnMut(&View, Vec<f32>),
 ) -> Result<Scores, OpError> {
     let mut scores = Vec::with_capacity(views.len());
     for view in views {
-        let camera = view.camera().relative_to(gaussians.origin);
-        let rendered = render(
-            gaussians,
-            &CameraTensors::from_camera(&camera, device),
-            settings,
-        )?;
-        let image = rendered.image().clamp(0.0, 1.0);
+        let image = rendered(model, view, settings, device, hooks)?;
         let target = photo(view, device);
         let scalar = |value: Tensor<1>| -> Result<f64, OpError> {
             Ok(to_host(value)?.first().copied().map_or(f64::NAN, f64::from))
@@ -65,6 +74,27 @@ pub fn evaluate(
         each(view, to_host(image)?);
     }
     Ok(Scores::of_views(scores))
+}
+
+/// The picture of a view that is scored, clamped to [0, 1].
+fn rendered<M: SplatModel>(
+    model: &M,
+    view: &View,
+    settings: &RenderSettings,
+    device: &Device,
+    hooks: &Hooks,
+) -> Result<Tensor<4>, OpError> {
+    let hook_view = HookView {
+        training_index: None,
+        name: &view.name,
+        purpose: Purpose::HeldOut,
+    };
+    let camera = view.camera().relative_to(model.origin());
+    let cameras = hooks.cameras(&hook_view, CameraTensors::from_camera(&camera, device))?;
+    let projected = project_gaussians(model, &cameras, settings)?;
+    let background = hooks.background(&hook_view, &cameras)?;
+    let rendered = render_projected_on(model, &projected, &cameras, background, settings)?;
+    Ok(hooks.image(&hook_view, rendered)?.image().clamp(0.0, 1.0))
 }
 
 impl Scores {

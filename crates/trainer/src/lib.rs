@@ -6,4 +6,8 @@ pub mod train;
 
 pub use evaluate::{Scores, ViewScore, evaluate};
 pub use photo::photo;
-pub use train::{LossTerms, TargetView, TrainConfig, TrainError, Trained, Trainer, Warning};
+pub use train::{
+    Checkpoint, CheckpointError, Command, History, Hook, HookView, LossTerms, Progress, Purpose,
+    Snapshot, TargetView, TrainConfig, TrainError, Trained, Trainer, TrainerBuilder, Warning,
+    command_queue,
+};

@@ -1,10 +1,8 @@
 //! Deliberately bad starts: a run of 500 steps ends, every parameter stays finite, and a warning names what is wrong.
 #![cfg(feature = "cpu")]
 
-use std::cell::RefCell;
 use std::path::Path;
-use std::rc::Rc;
-use std::sync::{Arc, OnceLock};
+use std::sync::{Arc, Mutex, OnceLock};
 
 use burn::tensor::Device;
 use rand::{RngExt, SeedableRng};
@@ -44,28 +42,27 @@ fn config() -> TrainConfig {
 
 /// Trains to the end, checks the parameters, and returns what was warned of.
 fn train(what: &str, capture: Capture, config: TrainConfig) -> Vec<Warning> {
-    let heard = Rc::new(RefCell::new(Vec::new()));
+    let heard = Arc::new(Mutex::new(Vec::new()));
     let hear = heard.clone();
     let steps = config.steps;
-    let trained = Trainer::builder()
-        .capture(capture)
+    let trained = Trainer::builder(capture)
         .config(config)
         .device(Device::flex())
-        .on_warning(move |warning| hear.borrow_mut().push(warning.clone()))
+        .on_warning(move |warning| hear.lock().unwrap().push(warning.clone()))
         .build()
         .unwrap()
         .run()
         .unwrap();
     assert_eq!(trained.steps, steps);
     assert_all_finite(&trained);
-    let warnings = heard.take();
+    let warnings = std::mem::take(&mut *heard.lock().unwrap());
     assert_eq!(trained.history.warnings, warnings);
     let history = &trained.history;
     println!(
         "{what}: loss {:.4} -> {:.4}, {} Gaussians, {:.1} s",
         history.losses[0].total,
         history.mean_loss(50).unwrap(),
-        trained.gaussians.len(),
+        trained.model.len(),
         trained.elapsed.as_secs_f64()
     );
     for warning in &warnings {
@@ -75,7 +72,7 @@ fn train(what: &str, capture: Capture, config: TrainConfig) -> Vec<Warning> {
 }
 
 fn assert_all_finite(trained: &Trained) {
-    let data = trained.gaussians.to_data();
+    let data = trained.model.to_data();
     let fields = [
         ("means", data.means.as_flattened()),
         ("log_scales", data.log_scales.as_flattened()),
@@ -257,8 +254,7 @@ fn black_points_learn_their_colours() {
                 point.color = [0; 3];
             }
         }
-        let trained = Trainer::builder()
-            .capture(capture)
+        let trained = Trainer::builder(capture)
             .config(TrainConfig {
                 steps: 1_500,
                 ..config()
@@ -268,7 +264,7 @@ fn black_points_learn_their_colours() {
             .unwrap()
             .run()
             .unwrap();
-        let sh0 = trained.gaussians.to_data().sh0;
+        let sh0 = trained.model.to_data().sh0;
         // A channel that never got a gradient is where black begins: at level 0, or at half a level.
         let start = |level: f64| ((level / 255.0 - 0.5) / 0.282_094_791_773_878_14) as f32;
         let starts = [start(0.0), start(0.5)];

@@ -37,8 +37,7 @@ fn trainer(capture: &Arc<Capture>, seed: u64) -> Trainer {
         seed,
         ..TrainConfig::default()
     };
-    Trainer::builder()
-        .capture(capture.clone())
+    Trainer::builder(capture.clone())
         .config(config)
         .device(Device::flex())
         .build()
@@ -61,7 +60,7 @@ fn first_step(unit: f64) -> Vec<(&'static str, Vec<f32>, i32)> {
     }
     let capture = capture(unit);
     let trainer = trainer(&capture, 0);
-    let gaussians = trainer.gaussians();
+    let gaussians = trainer.model();
     let settings = TrainConfig::default().render_settings(0, trainer.scene_scale());
     let camera = capture.views[3].camera().relative_to(gaussians.origin);
     let camera = CameraTensors::from_camera(&camera, &gaussians.means.device());
@@ -109,7 +108,7 @@ fn training_is_the_same_in_any_unit() {
             let views: Vec<_> = capture.test_views().collect();
             let settings = &trained.render_settings;
             let device = Device::flex();
-            evaluate(&trained.gaussians, &views, settings, &device, |_, _| {})
+            evaluate(&trained.model, &views, settings, &device, |_, _| {})
                 .unwrap()
                 .psnr
         };

@@ -91,8 +91,7 @@ fn capture() -> Arc<Capture> {
 
 /// Takes some steps of a run, and says whether it could: refusing is fine.
 fn train_steps(capture: Arc<Capture>, config: TrainConfig, checkpoint: Option<Checkpoint>) -> bool {
-    let mut trainer = Trainer::builder()
-        .capture(capture)
+    let mut trainer = Trainer::builder(capture)
         .config(config)
         .device(Device::flex());
     if let Some(checkpoint) = checkpoint {
@@ -102,7 +101,7 @@ fn train_steps(capture: Arc<Capture>, config: TrainConfig, checkpoint: Option<Ch
         return false;
     };
     // The third may already add and remove Gaussians.
-    let few = |trainer: &Trainer| trainer.gaussians().len() < 1_000;
+    let few = |trainer: &Trainer| trainer.model().len() < 1_000;
     (0..3).all(|_| !few(&trainer) || trainer.step().is_ok())
 }
 

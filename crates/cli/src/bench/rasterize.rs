@@ -83,14 +83,13 @@ pub(super) fn report(
         }
         None => {
             let config = input.config(global);
-            let trainer = Trainer::builder()
-                .capture(capture.clone())
+            let trainer = Trainer::builder(capture.clone())
                 .config(config.clone())
                 .device(device.clone())
                 .build()?;
             let name = format!("the first Gaussians of {}", capture.name);
             let settings = config.render_settings(0, trainer.scene_scale());
-            (trainer.gaussians().valid(), settings, name)
+            (trainer.model().valid(), settings, name)
         }
     };
     let views: Vec<&View> = capture.train_views().collect();

@@ -155,7 +155,7 @@ impl RunFolder<'_> {
     }
 
     fn save_checkpoint(&self, trained: &Trained) -> Result<(), CheckpointError> {
-        trained.checkpoint()?.save(&self.folder.join(CHECKPOINT))
+        trained.checkpoint()?.save(self.folder.join(CHECKPOINT))
     }
 
     fn remove_checkpoint(&self) -> Result<(), Failure> {
@@ -207,7 +207,7 @@ impl RunFolder<'_> {
             }
         };
         let settings = &trained.render_settings;
-        let scores = evaluate(&trained.gaussians, &views, settings, &chosen.device, keep);
+        let scores = evaluate(&trained.model, &views, settings, &chosen.device, keep);
         if !views.is_empty() {
             saving.keep(VIEWS, written);
         }
@@ -274,7 +274,7 @@ fn metrics(
     let seconds = |time: Duration| time.as_secs_f64();
     Metrics {
         scores: scores.clone(),
-        gaussians: trained.gaussians.len(),
+        gaussians: trained.model.len(),
         steps: trained.steps,
         seconds: seconds(trained.elapsed),
         seconds_per_step: seconds(trained.elapsed) / trained.steps as f64,

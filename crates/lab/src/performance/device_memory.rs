@@ -47,7 +47,7 @@ impl DeviceMemory {
         let usage = device.memory_pool_usage();
         let usage = usage.ok_or(PerformanceError::NotCubeCl)?;
         Ok(Self {
-            gaussians: trainer.gaussians().len() as u64,
+            gaussians: trainer.model().len() as u64,
             at_rest_bytes: usage.bytes_in_use.saturating_sub(before),
             most_bytes: most.saturating_sub(before),
             reserved_bytes: usage.bytes_reserved,

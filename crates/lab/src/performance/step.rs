@@ -128,7 +128,7 @@ pub(super) fn work_on(
     device: &Device,
 ) -> Result<Work, PerformanceError> {
     let trainer = trainer(capture, config, device)?;
-    let gaussians = trainer.gaussians().valid();
+    let gaussians = trainer.model().valid();
     let views: Vec<&View> = capture.train_views().collect();
     let settings = config.render_settings(0, trainer.scene_scale());
     Work::count(&gaussians, &sample(&views, VIEWS), &settings, device)
@@ -139,8 +139,7 @@ pub(super) fn trainer(
     config: &TrainConfig,
     device: &Device,
 ) -> Result<Trainer, PerformanceError> {
-    Ok(Trainer::builder()
-        .capture(capture.clone())
+    Ok(Trainer::builder(capture.clone())
         .config(config.clone())
         .device(device.clone())
         .build()?)
@@ -373,7 +372,7 @@ mod tests {
             downscale: 16,
             ..CaptureOptions::default()
         };
-        let capture = Arc::new(Capture::load(folder.as_ref(), &options).unwrap());
+        let capture = Arc::new(Capture::load(folder, &options).unwrap());
         let config = at_degree(&TrainConfig::default(), 3);
         let samples = on_threads(1, || run(&capture, &config, 1, 3)).unwrap();
         assert_eq!(samples.steps.len(), 3);

@@ -6,75 +6,16 @@
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 
+use super::formats::CaptureFormat;
+use super::sparse_model::{SparseCamera, SparseImage, SparseModel};
 use super::{CaptureError, CaptureWarning, Point, colmap_binary, colmap_text};
 use crate::text::Excerpt;
 
-/// A sparse model as read and checked: every number finite, every image's camera present, at least one image and
-/// one point.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct SparseModel {
-    /// Cameras by id.
-    pub cameras: HashMap<u32, Camera>,
-    /// Images, sorted by name.
-    pub images: Vec<Image>,
-    /// Points, in file order.
-    pub points: Vec<Point>,
-}
-
-/// A pinhole camera of the model.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Camera {
-    pub id: u32,
-    pub width: u32,
-    pub height: u32,
-    /// `[fx, fy, cx, cy]` in pixels, pixel centres at + 0.5 (COLMAP's convention is ours).
-    pub intrinsics: [f64; 4],
-}
-
-/// A registered image of the model.
-#[derive(Debug, Clone, PartialEq)]
-pub(super) struct Image {
-    pub id: u32,
-    pub camera_id: u32,
-    pub name: String,
-    /// Rotation from world to camera, (w, x, y, z), not necessarily of unit length.
-    pub quaternion: [f64; 4],
-    /// Translation from world to camera.
-    pub translation: [f64; 3],
-}
-
-impl Image {
-    /// World to camera, row-major 4x4, from the normalised quaternion and the translation.
-    pub fn viewmat(&self) -> [[f64; 4]; 4] {
-        // By the largest component first, so that the squares neither vanish nor overflow.
-        let largest = self.quaternion.iter().fold(0.0, |m: f64, q| m.max(q.abs()));
-        let scaled = self.quaternion.map(|q| q / largest);
-        let length = scaled.iter().map(|q| q * q).sum::<f64>().sqrt();
-        let [w, x, y, z] = scaled.map(|q| q / length);
-        let [tx, ty, tz] = self.translation;
-        [
-            [
-                1.0 - 2.0 * (y * y + z * z),
-                2.0 * (x * y - w * z),
-                2.0 * (x * z + w * y),
-                tx,
-            ],
-            [
-                2.0 * (x * y + w * z),
-                1.0 - 2.0 * (x * x + z * z),
-                2.0 * (y * z - w * x),
-                ty,
-            ],
-            [
-                2.0 * (x * z - w * y),
-                2.0 * (y * z + w * x),
-                1.0 - 2.0 * (x * x + y * y),
-                tz,
-            ],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    }
-}
+/// A folder with a COLMAP model in `sparse/0`, `sparse` or itself.
+pub(super) const FORMAT: CaptureFormat = CaptureFormat {
+    is_in: |root| find_folder(root).is_ok(),
+    read,
+};
 
 /// Camera models in the order of COLMAP's numbers, with how many parameters each has. New numbers are only ever
 /// appended, so what is missing here is refused by its number.
@@ -271,8 +212,8 @@ impl ModelFiles {
 /// Checks the three lists one by one and against each other.
 fn assemble(
     files: &ModelFiles,
-    cameras: Vec<Camera>,
-    mut images: Vec<Image>,
+    cameras: Vec<SparseCamera>,
+    mut images: Vec<SparseImage>,
     points: Vec<Point>,
 ) -> Result<SparseModel, CaptureError> {
     let mut by_id = HashMap::with_capacity(cameras.len());
@@ -325,7 +266,7 @@ fn assemble(
     })
 }
 
-fn check_camera(camera: &Camera) -> Result<(), String> {
+fn check_camera(camera: &SparseCamera) -> Result<(), String> {
     let [fx, fy, cx, cy] = camera.intrinsics;
     if camera.width == 0 || camera.height == 0 {
         return Err(format!("its size is {}x{}", camera.width, camera.height));
@@ -340,7 +281,11 @@ fn check_camera(camera: &Camera) -> Result<(), String> {
     Ok(())
 }
 
-fn check_image(image: &Image, cameras: &HashMap<u32, Camera>, unique: bool) -> Result<(), String> {
+fn check_image(
+    image: &SparseImage,
+    cameras: &HashMap<u32, SparseCamera>,
+    unique: bool,
+) -> Result<(), String> {
     if !unique {
         return Err("its name occurs twice".to_owned());
     }

@@ -6,7 +6,8 @@
 use std::fmt::Display;
 use std::path::Path;
 
-use super::colmap::{Camera, Image, model_name, pinhole_intrinsics, pinhole_parameters};
+use super::colmap::{model_name, pinhole_intrinsics, pinhole_parameters};
+use super::sparse_model::{SparseCamera, SparseImage};
 use super::{CaptureError, Point};
 
 /// Bytes of a camera record up to its parameters, of the shortest image record and of the shortest point record.
@@ -18,7 +19,7 @@ const KEYPOINT: usize = 8 + 8 + 8;
 const TRACK_ENTRY: usize = 4 + 4;
 
 /// Reads `cameras.bin`.
-pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<Camera>, CaptureError> {
+pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<SparseCamera>, CaptureError> {
     let mut reader = Reader::new(path, bytes);
     reader.records("camera", "cameras", MIN_CAMERA, |reader, record| {
         let id = reader.u32(record, "id")?;
@@ -36,7 +37,7 @@ pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<Camera>, Ca
         for value in &mut values[..parameters] {
             *value = reader.f64(record, "parameters")?;
         }
-        Ok(Camera {
+        Ok(SparseCamera {
             id,
             width,
             height,
@@ -46,7 +47,7 @@ pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<Camera>, Ca
 }
 
 /// Reads `images.bin`; the keypoints are skipped.
-pub(super) fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<Image>, CaptureError> {
+pub(super) fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<SparseImage>, CaptureError> {
     let mut reader = Reader::new(path, bytes);
     reader.records("image", "images", MIN_IMAGE, |reader, record| {
         let id = reader.u32(record, "id")?;
@@ -55,7 +56,7 @@ pub(super) fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<Image>, Capt
         let camera_id = reader.u32(record, "camera id")?;
         let name = reader.name(record)?;
         reader.skip_list(record, "keypoints", KEYPOINT)?;
-        Ok(Image {
+        Ok(SparseImage {
             id,
             camera_id,
             name,

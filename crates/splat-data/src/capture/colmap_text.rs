@@ -6,7 +6,8 @@
 use std::path::Path;
 use std::str::{FromStr, SplitAsciiWhitespace};
 
-use super::colmap::{Camera, Image, pinhole_intrinsics, pinhole_parameters};
+use super::colmap::{pinhole_intrinsics, pinhole_parameters};
+use super::sparse_model::{SparseCamera, SparseImage};
 use super::{CaptureError, CaptureWarning, Point};
 use crate::text::{Excerpt, lines, without_mark};
 
@@ -39,7 +40,10 @@ impl<T> Listed<T> {
 }
 
 /// Parses `cameras.txt`: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`. `path` is for messages.
-pub(super) fn parse_cameras(path: &Path, text: &[u8]) -> Result<Listed<Camera>, CaptureError> {
+pub(super) fn parse_cameras(
+    path: &Path,
+    text: &[u8],
+) -> Result<Listed<SparseCamera>, CaptureError> {
     let file = File::new(path, text)?;
     let camera = |mut fields: Fields<'_>| {
         let id = fields.next("camera id")?;
@@ -61,7 +65,7 @@ pub(super) fn parse_cameras(path: &Path, text: &[u8]) -> Result<Listed<Camera>, 
             let reason = format!("it has more than the {parameters} parameters of {model}");
             return Err(fields.error(&reason));
         }
-        Ok(Camera {
+        Ok(SparseCamera {
             id,
             width,
             height,
@@ -83,7 +87,7 @@ pub(super) fn parse_cameras(path: &Path, text: &[u8]) -> Result<Listed<Camera>, 
 /// The line of keypoints may be empty, and programs leave it out where there are none. So each line is taken for what it
 /// can be: keypoints are numbers only, three by three, which an image with a name is not. A line that could be either (a
 /// name of nothing but numbers, or keypoints that count like ids) is keypoints if it follows an image.
-pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<Image>, CaptureError> {
+pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<SparseImage>, CaptureError> {
     /// What the last line with anything on it, and an empty one after it, leave open.
     #[derive(PartialEq)]
     enum Next {
@@ -128,7 +132,7 @@ pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<Image>, Ca
 }
 
 /// The image of a line, or what is wrong with it.
-fn image(mut fields: Fields<'_>) -> Result<Image, String> {
+fn image(mut fields: Fields<'_>) -> Result<SparseImage, String> {
     let id = fields.parsed("image id")?;
     let quaternion = fields.parsed_array("quaternion")?;
     let translation = fields.parsed_array("translation")?;
@@ -138,7 +142,7 @@ fn image(mut fields: Fields<'_>) -> Result<Image, String> {
     if name.is_empty() {
         return Err("its name is missing".to_owned());
     }
-    Ok(Image {
+    Ok(SparseImage {
         id,
         camera_id,
         name: name.to_owned(),

@@ -10,7 +10,7 @@ use image::{DynamicImage, ImageError, ImageFormat, ImageReader};
 use rayon::prelude::*;
 use splat_core::memory::available_memory;
 
-use super::colmap::{Camera, Image, SparseModel};
+use super::sparse_model::{SparseCamera, SparseImage, SparseModel};
 use super::{CaptureError, CaptureOptions, CaptureWarning, View, downscale, jpeg};
 
 /// Least width and height of a photo: the window of SSIM.
@@ -71,7 +71,7 @@ pub(super) fn check_memory(
         let [width, height] = sides.map(|side| u64::from(side.div_ceil(factor)));
         width.saturating_mul(height).saturating_mul(3)
     };
-    let of_camera = |image: &Image| {
+    let of_camera = |image: &SparseImage| {
         let camera = &model.cameras[&image.camera_id];
         bytes([camera.width, camera.height])
     };
@@ -89,7 +89,7 @@ pub(super) fn check_memory(
         reader.with_guessed_format().ok()?.into_dimensions().ok()
     };
     // What cannot be read is told when it is decoded.
-    let of_photo = |image: &Image| {
+    let of_photo = |image: &SparseImage| {
         size(&folder.join(&image.name)).map_or(0, |(width, height)| bytes([width, height]))
     };
     let photos = model.images.par_iter().map(of_photo);
@@ -118,8 +118,8 @@ struct Loaded {
 
 fn load_one(
     folder: &Path,
-    image: &Image,
-    camera: &Camera,
+    image: &SparseImage,
+    camera: &SparseCamera,
     factor: u32,
 ) -> Result<Loaded, CaptureError> {
     let path = folder.join(&image.name);
@@ -229,7 +229,7 @@ fn undecodable(path: &Path, error: &ImageError) -> CaptureError {
 ///
 /// A rescale counts as uniform where one factor explains both sides to within a pixel (sizes are rounded). The sides
 /// are then scaled each by its own ratio, so that the photo's edges stay the camera's edges.
-fn fit_intrinsics(camera: &Camera, size: [u32; 2]) -> Option<[f64; 4]> {
+fn fit_intrinsics(camera: &SparseCamera, size: [u32; 2]) -> Option<[f64; 4]> {
     let [fx, fy, cx, cy] = camera.intrinsics;
     let [w, h] = size.map(f64::from);
     let [cam_w, cam_h] = [camera.width, camera.height].map(f64::from);

@@ -4,7 +4,8 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
-use super::colmap::{self, SparseModel};
+use super::colmap;
+use super::sparse_model::{SparseImage, SparseModel};
 use super::{Capture, CaptureError, Split, View, images};
 
 /// Photos have the size of their camera where it is smaller than this.
@@ -31,7 +32,7 @@ pub fn parse(binary: bool, files: [&[u8]; 3]) -> Result<Capture, CaptureError> {
     })
 }
 
-fn view(model: &SparseModel, image: &colmap::Image) -> View {
+fn view(model: &SparseModel, image: &SparseImage) -> View {
     let camera = &model.cameras[&image.camera_id];
     let side = |length: u32| length.clamp(images::MIN_SIDE, LARGEST_SIDE);
     let (width, height) = (side(camera.width), side(camera.height));

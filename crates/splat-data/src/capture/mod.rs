@@ -12,11 +12,13 @@ mod colmap_binary;
 mod colmap_text;
 mod downscale;
 mod error;
+mod formats;
 mod images;
 #[doc(hidden)]
 pub mod in_memory;
 mod jpeg;
 mod save;
+mod sparse_model;
 mod split;
 
 use std::collections::HashMap;
@@ -111,11 +113,12 @@ impl Capture {
     ///
     /// Whatever makes the capture unusable, see [`CaptureError`]. A capture of a single photo is read: whether there
     /// is anything to train on is for [`Capture::check_trainable`].
-    pub fn load(root: &Path, options: &CaptureOptions) -> Result<Self, CaptureError> {
+    pub fn load(root: impl AsRef<Path>, options: &CaptureOptions) -> Result<Self, CaptureError> {
+        let root = root.as_ref();
         if options.downscale == 0 {
             return Err(CaptureError::ZeroDownscale);
         }
-        let (model, mut warnings) = colmap::read(root)?;
+        let (model, mut warnings) = formats::read(root)?;
         let photos = images::folder(root, &model, options)?;
         let views = images::load(root, &photos, &model, options, &mut warnings)?;
         let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();

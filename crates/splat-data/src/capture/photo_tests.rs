@@ -49,7 +49,7 @@ fn photos_that_memory_cannot_hold_are_refused_before_they_are_read() {
     let capture = load(root.path()).unwrap();
     let bytes: u64 = capture.views.iter().map(|v| v.image.len() as u64).sum();
     let (mut model, _) = colmap::read(root.path()).unwrap();
-    let check = |model: &colmap::SparseModel, factor: u32, left: Option<u64>| {
+    let check = |model: &sparse_model::SparseModel, factor: u32, left: Option<u64>| {
         let folder = root.path().join("images");
         images::check_memory(root.path(), &folder, model, factor, left)
     };

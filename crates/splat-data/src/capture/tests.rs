@@ -58,7 +58,7 @@ fn text_and_binary_are_the_same_model() {
 #[test]
 fn the_example_is_the_same_as_text() {
     let (binary, _) = colmap::read(&example()).unwrap();
-    let parameters = |camera: &colmap::Camera| camera.intrinsics.to_vec();
+    let parameters = |camera: &sparse_model::SparseCamera| camera.intrinsics.to_vec();
     let text = TestCapture {
         cameras: binary
             .cameras

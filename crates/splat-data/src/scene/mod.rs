@@ -1,12 +1,15 @@
 //! Scene files: trained splats in and out, as plain data ([`SplatData`]) that knows no tensor.
 //!
-//! Today one format: [`ply`], the layout of the 3DGS paper's code, which every viewer reads.
+//! [`read()`] and [`write()`] know the format by the file. Today there is one: [`ply`], the layout of the 3DGS paper's
+//! code, which every viewer reads.
 
 pub mod ply;
 
 mod error;
+mod formats;
 
 pub use error::SceneFileError;
+pub use formats::{FORMATS, SceneFormat, read, write};
 
 use crate::SceneScale;
 

@@ -34,8 +34,17 @@ use ply_rs_bw::ply::{
 };
 use ply_rs_bw::writer::Writer;
 
-use super::{SceneFileError, SplatData};
+use super::{SceneFileError, SceneFormat, SplatData};
 use columns::{Columns, may_be};
+
+/// PLY files of splats.
+pub(super) const FORMAT: SceneFormat = SceneFormat {
+    name: "PLY",
+    endings: &["ply"],
+    is: |head| head.trim_ascii_start().starts_with(b"ply"),
+    read: |path| read(path),
+    write: |path, scene| write(path, scene),
+};
 
 /// Writes `scene` to `path`, whole or not at all: beside it first, then renamed. The disk has the new file before it
 /// loses the old one, so that a crash of the machine leaves one of them.
@@ -45,7 +54,8 @@ use columns::{Columns, may_be};
 /// [`SceneFileError::Shape`] where the arrays of the scene do not fit each other, [`SceneFileError::NotFinite`] and
 /// [`SceneFileError::Setting`] where a value means nothing and no reader would take it (NaN, or infinite where that means
 /// nothing), [`SceneFileError::Io`] where the file cannot be written.
-pub fn write(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
+pub fn write(path: impl AsRef<Path>, scene: &SplatData) -> Result<(), SceneFileError> {
+    let path = path.as_ref();
     scene.check_shape()?;
     let names = property_names(scene.sh_rest_len());
     let io_error = |source| SceneFileError::Io {
@@ -112,7 +122,8 @@ pub fn write(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
 /// # Errors
 ///
 /// [`SceneFileError`], naming the file and, where there is one, the property and the Gaussian.
-pub fn read(path: &Path) -> Result<SplatData, SceneFileError> {
+pub fn read(path: impl AsRef<Path>) -> Result<SplatData, SceneFileError> {
+    let path = path.as_ref();
     let io_error = |source| SceneFileError::Io {
         path: path.to_path_buf(),
         source,

@@ -1,105 +1,41 @@
-//! The whole state of a run in one safetensors file: the model, the optimiser's moments, the
-//! statistics of density control, how far it got, its settings, and what tells its capture from another. A resumed run
-//! goes on with the same numbers, or not at all.
+//! The whole state of a run in one safetensors file: the model with the moments of its optimisers, what the strategy and
+//! the hooks keep, how far it got, its settings, and what tells its capture from another. A resumed run goes on with the
+//! same numbers, or not at all.
+//!
+//! Tensors are named by what they belong to: `model.means` is a parameter, `[N, width]`, `model.means.moment_1` a moment of
+//! it, `strategy.gradients` what density control has summed up, `hook.exposure.gain` a parameter of the hook `exposure`.
 
 mod check;
+mod error;
 mod run;
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use burn::module::{Param, ParamId};
-use burn::store::RecordError;
-use burn::tensor::{Bytes, Device, Tensor, TensorData};
+use burn::tensor::{Device, TensorData};
+use burn_pack::Scalar;
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
 use serde::{Deserialize, Serialize};
-use splat_model::Gaussians;
-
-use super::{History, State};
 use splat_data::write_durably;
+use splat_model::SplatModel;
+use splat_model::optimizer::StateRecord;
 
+use super::History;
+use super::state::State;
+
+pub use error::CheckpointError;
 pub(super) use run::RunRecord;
 
 /// File format version; a reader refuses others.
-const VERSION: u32 = 3;
+const VERSION: u32 = 4;
 /// Key of the metadata entry that holds everything but tensors.
 const META: &str = "burn_splat";
 /// Key of the metadata entry with the checksum of everything else: a number that the disk lost would go on silently.
 const CHECKSUM: &str = "burn_splat_checksum";
 
-/// Why a checkpoint cannot be written or used.
-#[derive(Debug, thiserror::Error)]
-pub enum CheckpointError {
-    /// Reading or writing failed.
-    #[error("{path}: {source}")]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// Not a checkpoint of this program, or damaged.
-    #[error("{path}: not a usable checkpoint: {reason}")]
-    Format {
-        /// The file.
-        path: PathBuf,
-        /// What is wrong.
-        reason: String,
-    },
-    /// The checkpoint of a run on another capture.
-    #[error(
-        "{path}: the run was begun on another capture (`{name}`): {difference}; give the capture it was begun on, or begin another run in another folder"
-    )]
-    OtherCapture {
-        /// The file.
-        path: PathBuf,
-        /// Name of the run's capture.
-        name: String,
-        /// What differs, the first thing.
-        difference: String,
-    },
-    /// The checkpoint of a run with other settings.
-    #[error(
-        "{path}: the run was begun with {difference}; leave that out to go on with the run's settings, or begin another run in another folder"
-    )]
-    OtherSettings {
-        /// The file.
-        path: PathBuf,
-        /// Every such setting, with the two values.
-        difference: String,
-    },
-    /// Nothing would be left to train.
-    #[error(
-        "{path}: {done} of the run's {steps} steps are done; {wanted} would leave nothing to train, ask for more than {done}"
-    )]
-    NothingLeft {
-        /// The file.
-        path: PathBuf,
-        /// Steps done.
-        done: usize,
-        /// Steps of the run.
-        steps: usize,
-        /// Steps asked for.
-        wanted: usize,
-    },
-    /// The optimiser's state could not be packed.
-    #[error("the optimiser's state cannot be saved: {0}")]
-    Optimizer(#[from] RecordError),
-}
-
 /// Name, shape and values.
 type SavedTensor = (String, Vec<usize>, Vec<f32>);
-
-impl CheckpointError {
-    /// What failures of one kind share, so that a kind is told once.
-    pub(super) fn kind(&self) -> String {
-        match self {
-            Self::Io { path, source } => format!("{} {:?}", path.display(), source.kind()),
-            other => other.to_string(),
-        }
-    }
-}
 
 /// The state of a run, on the host.
 #[derive(Debug, Clone)]
@@ -107,7 +43,6 @@ pub struct Checkpoint {
     path: PathBuf,
     meta: Meta,
     tensors: Vec<SavedTensor>,
-    optimizer: Vec<u8>,
 }
 
 /// The part of [`Meta`] that all versions have.
@@ -124,36 +59,30 @@ struct Meta {
     elapsed_seconds: f64,
     /// As bits, which JSON does not round.
     origin_bits: [u64; 3],
-    /// Parameter ids, by which the optimiser knows its states; as strings, JSON has no u64.
-    param_ids: Vec<(String, String)>,
-    edits_seen: Vec<usize>,
+    /// Name of the strategy.
+    strategy: String,
+    /// Numbers of optimisers, strategy and hooks, named as tensors are.
+    scalars: BTreeMap<String, Scalar>,
     history: History,
 }
 
 impl Checkpoint {
-    /// The state of a run. The optimiser must have followed all edits of rows.
-    pub(super) fn of(
-        gaussians: &Gaussians,
-        state: &State,
+    /// The state of a run.
+    pub(super) fn of<M: SplatModel>(
+        state: &State<M>,
         run: &RunRecord,
     ) -> Result<Self, CheckpointError> {
-        let data = gaussians.to_data();
-        let n = data.len();
-        let rest = data.sh_rest_len();
-        let mut tensors = vec![
-            ("means", vec![n, 3], data.means.into_flattened()),
-            ("log_scales", vec![n, 3], data.log_scales.into_flattened()),
-            ("quats", vec![n, 4], data.quats.into_flattened()),
-            ("opacity_logits", vec![n], data.opacity_logits),
-            ("sh0", vec![n, 1, 3], data.sh0.into_flattened()),
-        ];
-        if rest > 0 {
-            tensors.push(("sh_rest", vec![n, rest / 3, 3], data.sh_rest));
-        }
-        if let Some((gradients, views)) = state.density.statistics() {
-            tensors.push(("density.gradients", vec![n], gradients));
-            tensors.push(("density.views", vec![n], views));
-        }
+        let unsaved = |reason: String| CheckpointError::State(reason);
+        let record = state.save().map_err(|error| unsaved(error.to_string()))?;
+        let tensors = record.tensors.into_iter().map(|(name, data)| {
+            let shape = data.shape().to_vec();
+            let float = data.dtype().is_float();
+            let values = data.convert::<f32>().try_into_vec::<f32>();
+            match (float, values) {
+                (true, Ok(values)) => Ok((name, shape, values)),
+                _ => Err(unsaved(format!("`{name}` is no tensor of floats"))),
+            }
+        });
         Ok(Self {
             path: PathBuf::from("checkpoint"),
             meta: Meta {
@@ -161,16 +90,12 @@ impl Checkpoint {
                 step: state.step,
                 run: run.clone(),
                 elapsed_seconds: state.elapsed.as_secs_f64(),
-                origin_bits: gaussians.origin.map(f64::to_bits),
-                param_ids: param_ids(gaussians),
-                edits_seen: state.edits.iter().map(|log| log.count()).collect(),
+                origin_bits: state.model.model().origin().map(f64::to_bits),
+                strategy: state.strategy.name(),
+                scalars: record.scalars,
                 history: state.history.clone(),
             },
-            tensors: tensors
-                .into_iter()
-                .map(|(name, shape, values)| (name.to_owned(), shape, values))
-                .collect(),
-            optimizer: state.optimizer.into_bytes()?.to_vec(),
+            tensors: tensors.collect::<Result<_, _>>()?,
         })
     }
 
@@ -181,7 +106,13 @@ impl Checkpoint {
 
     /// Number of Gaussians.
     pub fn gaussians(&self) -> usize {
-        self.find("means").map_or(0, |(_, shape, _)| shape[0])
+        let means = self.tensors.iter().find(|(name, ..)| name == check::MEANS);
+        means.map_or(0, |(_, shape, _)| shape[0])
+    }
+
+    /// Where in the world the means count from.
+    pub(super) fn origin(&self) -> [f64; 3] {
+        self.meta.origin_bits.map(f64::from_bits)
     }
 
     /// Writes the file beside its place and renames it, so that a crash, of the machine too, leaves the old one or the
@@ -189,7 +120,8 @@ impl Checkpoint {
     ///
     /// # Errors
     /// When the disk refuses.
-    pub fn save(&self, path: &Path) -> Result<(), CheckpointError> {
+    pub fn save(&self, path: impl AsRef<Path>) -> Result<(), CheckpointError> {
+        let path = path.as_ref();
         let format = |reason: String| CheckpointError::Format {
             path: path.to_path_buf(),
             reason,
@@ -209,14 +141,11 @@ impl Checkpoint {
             })
             .collect();
         let bad = |error: SafeTensorError| format(error.to_string());
-        let mut views = Vec::with_capacity(bytes.len() + 1);
+        let mut views = Vec::with_capacity(bytes.len());
         for (name, shape, bytes) in &bytes {
             let view = TensorView::new(Dtype::F32, shape.to_vec(), bytes).map_err(bad)?;
             views.push((*name, view));
         }
-        let length = vec![self.optimizer.len()];
-        let optimizer = TensorView::new(Dtype::U8, length, &self.optimizer).map_err(bad)?;
-        views.push(("optimizer", optimizer));
         let meta = serde_json::to_string(&self.meta).map_err(|error| format(error.to_string()))?;
         let contents = views.iter().map(|(name, view)| (*name, view.data()));
         let checksum = checksum(&meta, contents.collect());
@@ -232,7 +161,8 @@ impl Checkpoint {
     ///
     /// # Errors
     /// When it cannot be read or is not such a file.
-    pub fn load(path: &Path) -> Result<Self, CheckpointError> {
+    pub fn load(path: impl AsRef<Path>) -> Result<Self, CheckpointError> {
+        let path = path.as_ref();
         let bytes = std::fs::read(path).map_err(|source| CheckpointError::Io {
             path: path.to_path_buf(),
             source,
@@ -270,12 +200,7 @@ impl Checkpoint {
         }
         let meta: Meta = serde_json::from_str(meta).map_err(json)?;
         let mut tensors = Vec::new();
-        let mut optimizer = Vec::new();
         for (name, view) in file.tensors() {
-            if name == "optimizer" && view.dtype() == Dtype::U8 {
-                optimizer = view.data().to_vec();
-                continue;
-            }
             if view.dtype() != Dtype::F32 {
                 return Err(format(format!(
                     "tensor `{name}` is {:?}, not F32",
@@ -291,93 +216,35 @@ impl Checkpoint {
         }
         check::tensors(&tensors).map_err(format)?;
         check::meta(&meta).map_err(format)?;
-        check::optimizer(&optimizer, &meta, &tensors).map_err(format)?;
         Ok(Self {
             path: path.to_path_buf(),
             meta,
             tensors,
-            optimizer,
         })
     }
 
-    /// Puts a run back to where it was, and returns its model.
-    pub(super) fn restore(
+    /// Puts a run back to where it was.
+    pub(super) fn restore<M: SplatModel>(
         self,
-        state: &mut State,
+        state: &mut State<M>,
         device: &Device,
-    ) -> Result<Gaussians, CheckpointError> {
-        let gaussians = Gaussians {
-            origin: self.meta.origin_bits.map(f64::from_bits),
-            means: self.param("means", device)?,
-            log_scales: self.param("log_scales", device)?,
-            quats: self.param("quats", device)?,
-            opacity_logits: self.param("opacity_logits", device)?,
-            sh0: self.param("sh0", device)?,
-            sh_rest: match self.find("sh_rest") {
-                Some(_) => Some(self.param("sh_rest", device)?),
-                None => None,
-            },
+    ) -> Result<(), CheckpointError> {
+        let tensors = self.tensors.into_iter();
+        let tensors = tensors.map(|(name, shape, values)| (name, TensorData::new(values, shape)));
+        let record = StateRecord {
+            tensors: tensors.collect(),
+            scalars: self.meta.scalars,
         };
         let inner = device.clone().without_autodiff();
-        if self.find("density.views").is_some() {
-            state.density.restore_statistics(
-                self.tensor("density.gradients", &inner)?,
-                self.tensor("density.views", &inner)?,
-            );
-        }
-        for (log, count) in state.edits.iter().zip(&self.meta.edits_seen) {
-            log.resume(*count);
-        }
-        let optimizer = Bytes::from_bytes_vec(self.optimizer);
-        state.optimizer = state.optimizer.clone().from_bytes(optimizer)?;
+        let restored = state.restore(record, &inner);
+        restored.map_err(|reason| CheckpointError::Format {
+            path: self.path,
+            reason,
+        })?;
         state.step = self.meta.step;
         state.elapsed = Duration::try_from_secs_f64(self.meta.elapsed_seconds).unwrap_or_default();
         state.history = self.meta.history;
-        Ok(gaussians)
-    }
-
-    fn find(&self, name: &str) -> Option<&SavedTensor> {
-        self.tensors.iter().find(|(found, ..)| found == name)
-    }
-
-    fn tensor<const D: usize>(
-        &self,
-        name: &str,
-        device: &Device,
-    ) -> Result<Tensor<D>, CheckpointError> {
-        let format = |reason: String| CheckpointError::Format {
-            path: self.path.clone(),
-            reason,
-        };
-        let (_, shape, values) = self
-            .find(name)
-            .ok_or_else(|| format(format!("tensor `{name}` is missing")))?;
-        let shape: [usize; D] = shape
-            .as_slice()
-            .try_into()
-            .map_err(|_| format(format!("tensor `{name}` has shape {shape:?}")))?;
-        Ok(Tensor::from_data(
-            TensorData::new(values.clone(), shape),
-            device,
-        ))
-    }
-
-    fn param<const D: usize>(
-        &self,
-        name: &str,
-        device: &Device,
-    ) -> Result<Param<Tensor<D>>, CheckpointError> {
-        let value = self.tensor::<D>(name, device)?;
-        let id = self
-            .meta
-            .param_ids
-            .iter()
-            .find_map(|(field, id)| (field == name).then(|| id.parse::<u64>().ok()).flatten())
-            .ok_or_else(|| CheckpointError::Format {
-                path: self.path.clone(),
-                reason: format!("the id of parameter `{name}` is missing"),
-            })?;
-        Ok(Param::initialized(ParamId::from(id), value.require_grad()))
+        Ok(())
     }
 }
 
@@ -403,25 +270,6 @@ fn checksum(meta: &str, mut contents: Vec<(&str, &[u8])>) -> String {
         hasher.update(bytes);
     }
     hasher.finalize().to_string()
-}
-
-fn param_ids(gaussians: &Gaussians) -> Vec<(String, String)> {
-    let mut ids = vec![
-        ("means", gaussians.means.id),
-        ("log_scales", gaussians.log_scales.id),
-        ("quats", gaussians.quats.id),
-        ("opacity_logits", gaussians.opacity_logits.id),
-        ("sh0", gaussians.sh0.id),
-    ];
-    ids.extend(
-        gaussians
-            .sh_rest
-            .as_ref()
-            .map(|param| ("sh_rest", param.id)),
-    );
-    ids.into_iter()
-        .map(|(name, id)| (name.to_owned(), id.val().to_string()))
-        .collect()
 }
 
 #[cfg(all(test, feature = "cpu"))]

@@ -2,14 +2,14 @@
 
 use std::collections::HashMap;
 
-use splat_model::density::RunShape;
+use splat_model::strategy::StepInfo;
 
 use super::TrainConfig;
 use splat_data::{Capture, View};
 
 /// By what photos are divided at a step.
-pub(super) fn factor(config: &TrainConfig, run: RunShape, step: usize) -> u32 {
-    let stages = step / run.milestone(config.coarse_every);
+pub(super) fn factor(config: &TrainConfig, at: &StepInfo) -> u32 {
+    let stages = at.step / at.run.milestone(config.coarse_every);
     let left = (config.coarse_halvings as usize).saturating_sub(stages);
     1 << left
 }
@@ -43,6 +43,7 @@ mod tests {
 
     use super::*;
     use splat_model::SceneScale;
+    use splat_model::strategy::RunSchedule;
 
     use splat_data::CaptureOptions;
 
@@ -54,22 +55,25 @@ mod tests {
                 coarse_halvings: 2,
                 ..TrainConfig::default()
             };
-            let run = RunShape {
+            let run = RunSchedule {
                 steps,
                 scene_scale: SceneScale::new(1.0).unwrap(),
                 seed: 0,
             };
-            at.map(|step| factor(&config, run, step))
+            at.map(|step| factor(&config, &StepInfo { step, run }))
         };
         let expected = [4, 4, 2, 2, 1, 1];
         assert_eq!(factors(30_000, [0, 249, 250, 499, 500, 29_999]), expected);
         assert_eq!(factors(3_000, [0, 24, 25, 49, 50, 2_999]), expected);
-        let run = RunShape {
+        let run = RunSchedule {
             steps: 100,
             scene_scale: SceneScale::new(1.0).unwrap(),
             seed: 0,
         };
-        assert_eq!(factor(&TrainConfig::default(), run, 0), 1);
+        assert_eq!(
+            factor(&TrainConfig::default(), &StepInfo { step: 0, run }),
+            1
+        );
     }
 
     #[test]
@@ -79,7 +83,7 @@ mod tests {
             downscale: 4,
             ..CaptureOptions::default()
         };
-        let capture = Capture::load(folder.as_ref(), &options).unwrap();
+        let capture = Capture::load(folder, &options).unwrap();
         let mut views = CoarseViews::default();
         let small = views.view(&capture, 3, 2);
         let whole = &capture.views[3];

@@ -3,8 +3,8 @@
 use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
-use splat_model::density::AdaptiveSettings;
 use splat_model::ops::{AdamRows, ClampGradient, RasterizeSettings};
+use splat_model::strategy::AdcSettings;
 use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale};
 
 use splat_data::text::{one_line, utf8};
@@ -27,6 +27,8 @@ pub struct TrainConfig {
     pub seed: u64,
     /// Photos are area-averaged by this factor. Default 1.
     pub downscale: u32,
+    /// Views that a step renders and takes the mean loss of. Default 1.
+    pub views_per_step: usize,
     /// Training begins with photos whose sides are halved so many times, and doubles them step by step (3DGS section 7.1
     /// has 2: a quarter, then a half). Default 0: photos are as they are from the beginning.
     pub coarse_halvings: u32,
@@ -54,7 +56,7 @@ pub struct TrainConfig {
     /// Adaptive density control. Where `max_gaussians` is absent, growth ends at seven Gaussians for every ten pixels of a
     /// photo, or one for every hundred of all photos that are trained on (300 values for up to 59 parameters), whichever is
     /// more; docs/TRAINING.md has what more would give.
-    pub density: AdaptiveSettings,
+    pub density: AdcSettings,
 }
 
 impl Default for TrainConfig {
@@ -63,6 +65,7 @@ impl Default for TrainConfig {
             steps: 30_000,
             seed: 0,
             downscale: 1,
+            views_per_step: 1,
             coarse_halvings: 0,
             coarse_every: 250,
             sh_degree_every: 1_000,
@@ -73,7 +76,7 @@ impl Default for TrainConfig {
             deterministic: true,
             init: InitSettings::default(),
             rates: LearningRates::default(),
-            density: AdaptiveSettings::default(),
+            density: AdcSettings::default(),
         }
     }
 }
@@ -187,6 +190,7 @@ impl TrainConfig {
         ];
         let counts = [
             ("steps", self.steps),
+            ("views_per_step", self.views_per_step),
             ("coarse_every", self.coarse_every),
             ("sh_degree_every", self.sh_degree_every),
             ("density.every", self.density.every),

@@ -178,7 +178,7 @@ mod tests {
             downscale: 16,
             ..CaptureOptions::default()
         };
-        Capture::load(folder.as_ref(), &options).unwrap()
+        Capture::load(folder, &options).unwrap()
     }
 
     /// What was changed, and the words that must tell it.

@@ -4,7 +4,8 @@ use burn::optim::Optimizer;
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use splat_data::SplatData;
 use splat_model::losses::{SsimSettings, ssim};
-use splat_model::{CameraTensors, EditLog, Gaussians, RenderSettings, SplatAdam, render};
+use splat_model::optimizer::SplatAdam;
+use splat_model::{CameraTensors, Gaussians, RenderSettings, render};
 
 use super::super::case::Case;
 use super::super::measure::{AccuracyError, Outcome, clear, double, single};
@@ -271,7 +272,7 @@ fn adam_spike(device: &Device) -> Result<Outcome, AccuracyError> {
     const REST: usize = 10_000;
     const RATE: f64 = 1e-2;
     let spike = [1e-6, -1e-3, 1.0, 1e3f32];
-    let adam = SplatAdam::new(EditLog::default());
+    let adam = SplatAdam::new();
     let tensor = |values: [f32; 4]| Tensor::<1>::from_data(TensorData::from(values), device);
     let (mut value, mut state) = (tensor([0.0; 4]), None);
     for _ in 0..REST {

@@ -233,10 +233,10 @@ fn needle_outside() -> Vec<Scene> {
 
 fn relocation(_: &Device) -> Result<Outcome, AccuracyError> {
     // 51 copies of an opaque Gaussian, from the series of the paper in decimal arithmetic of 90 digits.
-    let (opacity, factor) = splat_model::density::relocate(1.0, 51);
+    let (opacity, factor) = splat_model::strategy::relocate(1.0, 51);
     let error = (factor / 0.420_778_371_403_541_15 - 1.0).abs();
     let finite = [0.0, 1e-300, 0.5, 1.0 - 1e-16, 1.0].iter().all(|o| {
-        let (o, f) = splat_model::density::relocate(*o, 51);
+        let (o, f) = splat_model::strategy::relocate(*o, 51);
         o.is_finite() && f.is_finite()
     });
     let outcome = Outcome {

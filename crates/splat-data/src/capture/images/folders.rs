@@ -3,7 +3,7 @@
 use std::collections::{BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
-use super::super::colmap::SparseModel;
+use super::super::sparse_model::SparseModel;
 use super::super::{CaptureError, CaptureWarning};
 
 /// Endings of the files that are photos: what structure from motion reads, not only what is read here.

@@ -76,8 +76,8 @@ fn round_trip_is_exact_in_every_degree() {
     for degree in 0..=3 {
         let mut scene = scene(7, degree);
         scene.means[3] = [-0.0, f32::MIN_POSITIVE / 8.0, f32::MAX];
-        write(&file_in(&folder), &scene).unwrap();
-        let back = read(&file_in(&folder)).unwrap();
+        write(file_in(&folder), &scene).unwrap();
+        let back = read(file_in(&folder)).unwrap();
         assert_eq!(back, scene);
         assert_eq!(
             back.means[3].map(f32::to_bits),
@@ -92,7 +92,7 @@ fn round_trip_is_exact_in_every_degree() {
 fn the_layout_is_that_of_3dgs() {
     let folder = TempDir::new().unwrap();
     let scene = scene(2, 1);
-    write(&file_in(&folder), &scene).unwrap();
+    write(file_in(&folder), &scene).unwrap();
     let bytes = std::fs::read(file_in(&folder)).unwrap();
     let header = "ply\nformat binary_little_endian 1.0\nelement vertex 2\n\
         property float x\nproperty float y\nproperty float z\n\
@@ -131,7 +131,7 @@ fn ascii_in_any_order_is_read() {
         let scene = scene(3, degree);
         for kind in ["float", "double"] {
             std::fs::write(file_in(&folder), ascii(&scene, kind)).unwrap();
-            assert_eq!(read(&file_in(&folder)).unwrap(), scene);
+            assert_eq!(read(file_in(&folder)).unwrap(), scene);
         }
     }
 }
@@ -157,13 +157,13 @@ fn big_endian_doubles_behind_another_element_are_read() {
     }
     let folder = TempDir::new().unwrap();
     std::fs::write(file_in(&folder), &bytes).unwrap();
-    assert_eq!(read(&file_in(&folder)).unwrap(), scene);
+    assert_eq!(read(file_in(&folder)).unwrap(), scene);
 }
 
 #[test]
 fn every_truncation_is_an_error() {
     let folder = TempDir::new().unwrap();
-    write(&file_in(&folder), &scene(2, 0)).unwrap();
+    write(file_in(&folder), &scene(2, 0)).unwrap();
     let bytes = std::fs::read(file_in(&folder)).unwrap();
     for end in 0..bytes.len() {
         error_of(&bytes[..end]);
@@ -187,7 +187,7 @@ fn every_truncation_is_an_error() {
 #[test]
 fn a_damaged_count_is_no_huge_allocation() {
     let folder = TempDir::new().unwrap();
-    write(&file_in(&folder), &scene(1, 3)).unwrap();
+    write(file_in(&folder), &scene(1, 3)).unwrap();
     let bytes = std::fs::read(file_in(&folder)).unwrap();
     let text = b"element vertex 1\n";
     let at = bytes.windows(text.len()).position(|w| w == text).unwrap();
@@ -283,13 +283,13 @@ fn arrays_that_do_not_fit_are_named() {
     let folder = TempDir::new().unwrap();
     let mut bad = scene(3, 1);
     bad.sh_rest.pop();
-    let message = write(&file_in(&folder), &bad).unwrap_err().to_string();
+    let message = write(file_in(&folder), &bad).unwrap_err().to_string();
     assert!(
         message.contains("sh_rest has 26 entries instead of 27"),
         "{message}"
     );
     bad.sh_degree = 4;
-    assert!(write(&file_in(&folder), &bad).is_err());
+    assert!(write(file_in(&folder), &bad).is_err());
 }
 
 /// A text file of one Gaussian with these lines after the first, the values last.
@@ -481,7 +481,7 @@ fn odd_headers_are_read() {
     }
     // Behind the last line of a header with carriage returns come the values, to the byte.
     let folder = TempDir::new().unwrap();
-    write(&file_in(&folder), &scene(2, 1)).unwrap();
+    write(file_in(&folder), &scene(2, 1)).unwrap();
     let bytes = std::fs::read(file_in(&folder)).unwrap();
     let end = b"end_header\n";
     let at = bytes.windows(end.len()).position(|w| w == end).unwrap() + end.len();
@@ -510,7 +510,7 @@ fn headers_that_announce_too_much_end_soon() {
     );
 
     let folder = TempDir::new().unwrap();
-    write(&file_in(&folder), &scene(1, 0)).unwrap();
+    write(file_in(&folder), &scene(1, 0)).unwrap();
     let bytes = std::fs::read(file_in(&folder)).unwrap();
     let text = b"element vertex 1\n";
     let at = bytes.windows(text.len()).position(|w| w == text).unwrap();
@@ -551,7 +551,7 @@ fn a_name_that_occurs_twice_is_refused_whatever_it_names() {
 #[test]
 fn an_element_without_properties_takes_no_time() {
     let folder = TempDir::new().unwrap();
-    write(&file_in(&folder), &scene(2, 1)).unwrap();
+    write(file_in(&folder), &scene(2, 1)).unwrap();
     let bytes = std::fs::read(file_in(&folder)).unwrap();
     let at = bytes.windows(7).position(|w| w == b"element").unwrap();
     let (before, after) = bytes.split_at(at);

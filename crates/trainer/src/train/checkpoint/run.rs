@@ -69,12 +69,13 @@ impl Checkpoint {
         changes
     }
 
-    /// Checks that the run is this one: its capture, its settings, the names of its loss terms. Returns the photos
+    /// Checks that the run is this one: its capture, its settings, its strategy, the names of its loss terms. Returns the photos
     /// that have other pixels.
     pub(in super::super) fn check_run(
         &self,
         run: &RunRecord,
         terms: &[String],
+        strategy: &str,
     ) -> Result<Vec<String>, CheckpointError> {
         self.check_settings(&run.config)?;
         let was = &self.meta.run.capture;
@@ -83,6 +84,12 @@ impl Checkpoint {
                 path: self.path.clone(),
                 name: was.name().to_owned(),
                 difference,
+            });
+        }
+        if self.meta.strategy != strategy {
+            return Err(CheckpointError::OtherSettings {
+                path: self.path.clone(),
+                difference: format!("the strategy {}, not {strategy}", self.meta.strategy),
             });
         }
         if self.meta.history.terms != terms {

@@ -4,7 +4,7 @@ use std::collections::HashSet;
 
 use glam::DVec3;
 use rayon::prelude::*;
-use splat_model::Gaussians;
+use splat_data::SplatData;
 
 use super::{Warning, median, quantile};
 use crate::train::TrainConfig;
@@ -41,7 +41,7 @@ const HIGH_RATE: f64 = 5.0;
 /// Everything that looks wrong.
 pub(in crate::train) fn inspect(
     capture: &Capture,
-    gaussians: &Gaussians,
+    splats: &SplatData,
     config: &TrainConfig,
 ) -> Vec<Warning> {
     let positions: Vec<DVec3> = capture
@@ -56,8 +56,8 @@ pub(in crate::train) fn inspect(
         .collect();
     let distance = median(outlooks.iter().map(|outlook| outlook.middle));
     let mut warnings = Vec::new();
-    warnings.extend(crowded(&positions, gaussians.origin.into(), distance));
-    warnings.extend(large(gaussians, config, distance));
+    warnings.extend(crowded(&positions, splats.origin.into(), distance));
+    warnings.extend(large(splats, config, distance));
     warnings.extend(cameras(capture, &outlooks));
     warnings.extend(noise(&capture.views));
     warnings.extend(high_rates(config));
@@ -110,8 +110,8 @@ fn crowded(positions: &[DVec3], origin: DVec3, distance: f64) -> Option<Warning>
         .then_some(Warning::CompactPoints { radius, distance })
 }
 
-fn large(gaussians: &Gaussians, config: &TrainConfig, distance: f64) -> Option<Warning> {
-    let log_scales = gaussians.to_data().log_scales;
+fn large(splats: &SplatData, config: &TrainConfig, distance: f64) -> Option<Warning> {
+    let log_scales = &splats.log_scales;
     let largest = |scales: &[f32; 3]| f64::from(scales.iter().copied().fold(f32::MIN, f32::max));
     let scale = median(log_scales.iter().map(largest)).exp();
     (scale > LARGE * distance).then_some(Warning::LargeGaussians {

@@ -5,7 +5,7 @@
 const BITS: u32 = 21;
 
 /// The order in which to store Gaussians with these means: indices, by code. Means that are not finite come first.
-pub(super) fn order(means: &[[f32; 3]]) -> Vec<usize> {
+pub(crate) fn order(means: &[[f32; 3]]) -> Vec<usize> {
     let finite = || {
         means
             .iter()

@@ -1,88 +1,12 @@
-//! Adam (Kingma & Ba 2015) whose moments follow the rows of a parameter when density control adds,
-//! removes or reorders them.
-//!
-//! `ModuleOptimizer` keeps the states of its parameters to itself, so an edit reaches them through
-//! the optimiser: density control appends it to the [`EditLog`] that the optimiser shares, and every
-//! state applies, on its next step, the edits that it has not seen. Moments never leave the device.
-
-use std::sync::{Arc, Mutex, PoisonError};
+//! Adam (Kingma & Ba 2015) in one pass over memory.
 
 use burn::optim::{LearningRate, Optimizer, RecordState, StateSink, StateSource};
-use burn::tensor::{Device, Int, Tensor};
+use burn::tensor::{Device, Tensor};
+use splat_data::SceneScale;
 use splat_ops::{AdamRows, AdamStep, adam_step};
 
-/// What happened to the rows of a parameter.
-#[derive(Debug, Clone)]
-#[expect(clippy::large_enum_variant, reason = "a handful exist at a time")]
-pub enum RowEdit {
-    /// Row i of the new parameter continues row `source[i]` of the old one where `keep[i]` is one;
-    /// where it is zero its moments start anew.
-    Gather {
-        /// `[N_new]`, indices into the old rows.
-        source: Tensor<1, Int>,
-        /// `[N_new]`, one or zero.
-        keep: Tensor<1>,
-    },
-    /// All moments start anew; the values were overwritten.
-    Restart,
-}
-
-/// The edits of one parameter so far, shared between whoever edits it and its optimiser.
-#[derive(Debug, Clone, Default)]
-pub struct EditLog {
-    inner: Arc<Mutex<Edits>>,
-}
-
-#[derive(Debug, Default)]
-struct Edits {
-    /// Number of edits before `recent`; no state needs those any more.
-    forgotten: usize,
-    recent: Vec<RowEdit>,
-}
-
-impl EditLog {
-    /// Records an edit.
-    pub fn push(&self, edit: RowEdit) {
-        self.with(|edits| edits.recent.push(edit));
-    }
-
-    /// Continues the count of a saved run: states saved after `count` edits have seen them all.
-    pub fn resume(&self, count: usize) {
-        self.with(|edits| {
-            *edits = Edits {
-                forgotten: count,
-                recent: Vec::new(),
-            }
-        });
-    }
-
-    /// Number of edits so far.
-    pub fn count(&self) -> usize {
-        self.with(|edits| edits.forgotten + edits.recent.len())
-    }
-
-    /// Whether an edit waits for the optimiser's next step.
-    pub fn is_pending(&self) -> bool {
-        self.with(|edits| !edits.recent.is_empty())
-    }
-
-    /// The edits from number `seen` on. One log serves one parameter, so what is handed out is
-    /// forgotten.
-    fn take_since(&self, seen: usize) -> Vec<RowEdit> {
-        self.with(|edits| {
-            let skip = seen.saturating_sub(edits.forgotten).min(edits.recent.len());
-            let fresh = edits.recent.split_off(skip);
-            edits.forgotten += edits.recent.len() + fresh.len();
-            edits.recent.clear();
-            fresh
-        })
-    }
-
-    fn with<R>(&self, action: impl FnOnce(&mut Edits) -> R) -> R {
-        // A panic elsewhere cannot leave the list half-edited, so a poisoned lock is still good.
-        action(&mut self.inner.lock().unwrap_or_else(PoisonError::into_inner))
-    }
-}
+use super::edit::{MomentEdit, RowOptimizer};
+use crate::Field;
 
 /// Adam for one field of the Gaussians.
 ///
@@ -98,19 +22,34 @@ pub struct SplatAdam {
     pub epsilon: f64,
     /// Which rows take a step. [`AdamRows::Seen`] is another optimiser with other results: measure before relying on it.
     pub rows: AdamRows,
-    edits: EditLog,
+}
+
+impl Default for SplatAdam {
+    fn default() -> Self {
+        Self::new()
+    }
 }
 
 impl SplatAdam {
     /// The settings of 3DGS: betas 0.9 and 0.999, epsilon 1e-15, all rows.
-    pub fn new(edits: EditLog) -> Self {
+    pub fn new() -> Self {
         Self {
             beta_1: 0.9,
             beta_2: 0.999,
             epsilon: 1e-15,
             rows: AdamRows::All,
-            edits,
         }
+    }
+
+    /// The settings for a field, stepping `rows`: where its values are lengths, epsilon, one over a length, follows the
+    /// size of the scene.
+    pub fn of_field(field: &Field, rows: AdamRows, scene: SceneScale) -> Self {
+        let mut adam = Self::new();
+        adam.rows = rows;
+        if field.is_length {
+            adam.epsilon = scene.means_epsilon();
+        }
+        adam
     }
 }
 
@@ -119,35 +58,16 @@ impl SplatAdam {
 pub struct SplatAdamState<const D: usize> {
     /// Steps taken.
     pub time: usize,
-    /// Number of edits of the [`EditLog`] that the moments have followed.
-    pub edits_seen: usize,
     /// First moment, of the parameter's shape.
     pub moment_1: Tensor<D>,
     /// Second moment, of the parameter's shape.
     pub moment_2: Tensor<D>,
 }
 
-impl<const D: usize> SplatAdamState<D> {
-    fn apply(&mut self, edit: RowEdit) {
-        let follow = |moment: Tensor<D>| match &edit {
-            RowEdit::Gather { source, keep } => {
-                let mut mask_shape = [1; D];
-                mask_shape[0] = keep.dims()[0];
-                moment.select(0, source.clone()) * keep.clone().reshape(mask_shape)
-            }
-            RowEdit::Restart => moment.zeros_like(),
-        };
-        self.moment_1 = follow(self.moment_1.clone());
-        self.moment_2 = follow(self.moment_2.clone());
-        self.edits_seen += 1;
-    }
-}
-
 // By hand: the derive names crates that only Burn itself depends on.
 impl<const D: usize> RecordState for SplatAdamState<D> {
     fn state_flatten(&self, prefix: &str, out: &mut StateSink) {
         out.push_scalar(prefix, "time", self.time.into());
-        out.push_scalar(prefix, "edits_seen", self.edits_seen.into());
         out.push_tensor(prefix, "moment_1", self.moment_1.to_data());
         out.push_tensor(prefix, "moment_2", self.moment_2.to_data());
     }
@@ -155,7 +75,6 @@ impl<const D: usize> RecordState for SplatAdamState<D> {
     fn state_unflatten(prefix: &str, src: &mut StateSource, device: &Device) -> Option<Self> {
         Some(Self {
             time: usize::try_from(src.take_scalar(prefix, "time")?).ok()?,
-            edits_seen: usize::try_from(src.take_scalar(prefix, "edits_seen")?).ok()?,
             moment_1: Tensor::from_data(src.take_tensor(prefix, "moment_1")?, device),
             moment_2: Tensor::from_data(src.take_tensor(prefix, "moment_2")?, device),
         })
@@ -172,23 +91,11 @@ impl Optimizer for SplatAdam {
         grad: Tensor<D>,
         state: Option<Self::State<D>>,
     ) -> (Tensor<D>, Option<Self::State<D>>) {
-        let mut state = match state {
-            Some(mut state) => {
-                for edit in self.edits.take_since(state.edits_seen) {
-                    state.apply(edit);
-                }
-                state
-            }
-            None => {
-                self.edits.take_since(0);
-                SplatAdamState {
-                    time: 0,
-                    edits_seen: self.edits.count(),
-                    moment_1: grad.zeros_like(),
-                    moment_2: grad.zeros_like(),
-                }
-            }
-        };
+        let mut state = state.unwrap_or_else(|| SplatAdamState {
+            time: 0,
+            moment_1: grad.zeros_like(),
+            moment_2: grad.zeros_like(),
+        });
         state.time += 1;
         let time = state.time as f64;
         let correction_1 = 1.0 - self.beta_1.powf(time);
@@ -218,6 +125,16 @@ impl Optimizer for SplatAdam {
     }
 }
 
+impl RowOptimizer for SplatAdam {
+    fn edit_rows(state: SplatAdamState<2>, edit: &MomentEdit) -> SplatAdamState<2> {
+        SplatAdamState {
+            time: state.time,
+            moment_1: edit.apply(state.moment_1),
+            moment_2: edit.apply(state.moment_2),
+        }
+    }
+}
+
 #[cfg(all(test, feature = "cpu"))]
 mod tests {
     use super::*;
@@ -240,7 +157,7 @@ mod tests {
     fn the_numbers_are_those_of_burns_adam() {
         let device = Device::flex();
         let theirs = AdamConfig::new().with_epsilon(1e-15).build();
-        let ours = SplatAdam::new(EditLog::default());
+        let ours = SplatAdam::new();
         let start = Tensor::<2>::from_floats([[1.0, -2.0], [0.5, 3.0], [0.0, 0.1]], &device);
         let (mut a, mut b) = (start.clone(), start);
         let (mut state_a, mut state_b) = (None, None);
@@ -257,9 +174,9 @@ mod tests {
     #[test]
     fn of_seen_rows_only_the_others_keep_everything() {
         let device = Device::flex();
-        let mut adam = SplatAdam::new(EditLog::default());
+        let mut adam = SplatAdam::new();
         adam.rows = AdamRows::Seen;
-        let all = SplatAdam::new(EditLog::default());
+        let all = SplatAdam::new();
         let start = Tensor::<2>::from_floats([[1.0, -2.0], [0.5, 3.0], [0.0, 0.1]], &device);
         let (first, state) = adam.step(0.01, start.clone(), gradient(0, &device), None);
         let (same, _) = all.step(0.01, start, gradient(0, &device), None);
@@ -293,7 +210,7 @@ mod tests {
     #[test]
     fn gradients_that_are_not_finite_leave_no_trace() {
         let device = Device::flex();
-        let adam = SplatAdam::new(EditLog::default());
+        let adam = SplatAdam::new();
         let start = Tensor::<2>::from_floats([[1.0, -2.0], [0.5, 3.0], [0.0, 0.1]], &device);
         let spoiled = [
             (0, f32::NAN),
@@ -321,41 +238,5 @@ mod tests {
         let ended = with(|bad| bad);
         assert_eq!(ended, with(|_| 0.0));
         assert!(ended.iter().all(|x| x.is_finite()), "{ended:?}");
-    }
-
-    #[test]
-    fn moments_follow_their_rows_and_new_rows_start_anew() {
-        let device = Device::flex();
-        let log = EditLog::default();
-        let adam = SplatAdam::new(log.clone());
-        let tensor = Tensor::<2>::zeros([3, 2], &device);
-        let (_, state) = adam.step(0.01, tensor.clone(), gradient(0, &device), None);
-        let before = values(state.clone().unwrap().moment_1);
-
-        // Row 0 goes, rows 2 and 1 change places, a copy of row 1 is new.
-        log.push(RowEdit::Gather {
-            source: Tensor::from_ints([2, 1, 1], &device),
-            keep: Tensor::from_floats([1.0, 1.0, 0.0], &device),
-        });
-        assert!(log.is_pending());
-        let nothing = Tensor::<2>::zeros([3, 2], &device);
-        let (_, state) = adam.step(0.01, tensor.clone(), nothing.clone(), state);
-        assert!(!log.is_pending());
-        let expected = [before[4], before[5], before[2], before[3], 0.0, 0.0];
-        for (ours, expected) in values(state.clone().unwrap().moment_1)
-            .into_iter()
-            .zip(expected)
-        {
-            assert!(
-                (ours - 0.9 * expected).abs() <= 1e-7 * expected.abs(),
-                "{ours} {expected}"
-            );
-        }
-
-        log.push(RowEdit::Restart);
-        let (_, state) = adam.step(0.01, tensor, nothing, state);
-        let state = state.unwrap();
-        assert!(values(state.moment_2).iter().all(|moment| *moment == 0.0));
-        assert_eq!((state.edits_seen, log.count()), (2, 2));
     }
 }

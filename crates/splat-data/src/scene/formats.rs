@@ -1,0 +1,89 @@
+//! The formats of scene files, and which of them a file is in.
+
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+use super::{SceneFileError, SplatData, ply};
+
+/// A format of scene files.
+pub struct SceneFormat {
+    /// What people call it.
+    pub name: &'static str,
+    /// Endings of its files, without the dot, in lower case.
+    pub endings: &'static [&'static str],
+    /// Whether a file begins as one in this format does, given its first 64 bytes or all of a shorter one.
+    pub is: fn(&[u8]) -> bool,
+    /// Reads a file.
+    pub read: fn(&Path) -> Result<SplatData, SceneFileError>,
+    /// Writes a file, whole or not at all.
+    pub write: fn(&Path, &SplatData) -> Result<(), SceneFileError>,
+}
+
+/// Every format.
+pub const FORMATS: &[SceneFormat] = &[ply::FORMAT];
+
+/// Bytes from which a format is known.
+const HEAD: u64 = 64;
+
+/// Reads a scene in any format: the one that the file's first bytes are of, or else that of its name, or else the first.
+///
+/// # Errors
+/// When the file cannot be read or is not in the format, see [`SceneFileError`].
+pub fn read(path: impl AsRef<Path>) -> Result<SplatData, SceneFileError> {
+    let path = path.as_ref();
+    let mut head = Vec::new();
+    // A pipe gives its bytes once; whatever else cannot be read says so when it is read in earnest.
+    if path.is_file()
+        && let Ok(file) = File::open(path)
+    {
+        let _ = file.take(HEAD).read_to_end(&mut head);
+    }
+    let format = FORMATS.iter().find(|format| (format.is)(&head));
+    let format = format.or_else(|| of_name(path)).unwrap_or(&FORMATS[0]);
+    (format.read)(path)
+}
+
+/// Writes a scene in the format of the file's name; PLY where it says none.
+///
+/// # Errors
+/// When the scene cannot be written, see [`SceneFileError`].
+pub fn write(path: impl AsRef<Path>, scene: &SplatData) -> Result<(), SceneFileError> {
+    let path = path.as_ref();
+    (of_name(path).unwrap_or(&FORMATS[0]).write)(path, scene)
+}
+
+fn of_name(path: &Path) -> Option<&'static SceneFormat> {
+    let ending = path.extension()?.to_str()?.to_lowercase();
+    FORMATS
+        .iter()
+        .find(|format| format.endings.contains(&ending.as_str()))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_is_known_by_its_bytes_then_by_its_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = SplatData {
+            means: vec![[1.0, 2.0, 3.0]],
+            log_scales: vec![[0.0; 3]],
+            quats: vec![[1.0, 0.0, 0.0, 0.0]],
+            opacity_logits: vec![0.5],
+            sh0: vec![[0.1; 3]],
+            ..SplatData::default()
+        };
+        for name in ["scene.ply", "scene.PLY", "scene"] {
+            let path = folder.path().join(name);
+            write(&path, &scene).unwrap();
+            assert_eq!(read(&path).unwrap(), scene, "{name}");
+        }
+        let missing = read(folder.path().join("none.ply"))
+            .unwrap_err()
+            .to_string();
+        assert!(missing.contains("none.ply"), "{missing}");
+        assert!(of_name("a.b/scene".as_ref()).is_none());
+    }
+}

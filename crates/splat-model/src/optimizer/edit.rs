@@ -1,0 +1,83 @@
+//! Edits of moments, on the device, for the optimisers of the Adam family.
+
+use burn::optim::{Adam, AdamState, AdamW, AdamWState, AdaptiveMomentumState, Optimizer};
+use burn::tensor::{Int, Tensor};
+
+use super::field_optimizer::StateRecord;
+
+/// What an edit of rows does to a moment.
+#[derive(Debug, Clone)]
+#[expect(clippy::large_enum_variant, reason = "a handful exist at a time")]
+pub enum MomentEdit {
+    /// Row i continues row `source[i]` where `keep[i]` is one; where it is zero it starts anew.
+    Gather {
+        /// `[N_new]`, indices into the old rows.
+        source: Tensor<1, Int>,
+        /// `[N_new]`, one or zero.
+        keep: Tensor<1>,
+    },
+    /// All rows start anew.
+    Restart,
+}
+
+impl MomentEdit {
+    /// The moment `[N, width]` after the edit, `[N_new, width]`.
+    pub fn apply(&self, moment: Tensor<2>) -> Tensor<2> {
+        match self {
+            Self::Gather { source, keep } => {
+                moment.select(0, source.clone()) * keep.clone().unsqueeze_dim(1)
+            }
+            Self::Restart => moment.zeros_like(),
+        }
+    }
+}
+
+/// A Burn optimiser whose state can follow edits of rows. [`ThroughHost`](super::ThroughHost) makes one of any other.
+pub trait RowOptimizer: Optimizer {
+    /// The state of a parameter `[N, width]` after an edit of its rows.
+    fn edit_rows(state: Self::State<2>, edit: &MomentEdit) -> Self::State<2>;
+
+    /// Checks a saved state of a parameter of this shape before it is put together. Here every tensor must have the
+    /// parameter's shape.
+    ///
+    /// # Errors
+    /// What does not fit, in a line.
+    fn check_state(record: &StateRecord, shape: [usize; 2]) -> Result<(), String> {
+        match record
+            .tensors
+            .iter()
+            .find(|(_, data)| data.shape()[..] != shape)
+        {
+            None => Ok(()),
+            Some((name, data)) => Err(format!(
+                "`{name}` has shape {:?} instead of {shape:?}",
+                data.shape().to_vec()
+            )),
+        }
+    }
+}
+
+impl RowOptimizer for Adam {
+    fn edit_rows(state: AdamState<2>, edit: &MomentEdit) -> AdamState<2> {
+        AdamState {
+            momentum: adaptive(state.momentum, edit),
+        }
+    }
+}
+
+impl RowOptimizer for AdamW {
+    fn edit_rows(state: AdamWState<2>, edit: &MomentEdit) -> AdamWState<2> {
+        AdamWState {
+            momentum: adaptive(state.momentum, edit),
+        }
+    }
+}
+
+fn adaptive(state: AdaptiveMomentumState<2>, edit: &MomentEdit) -> AdaptiveMomentumState<2> {
+    AdaptiveMomentumState {
+        time: state.time,
+        moment_1: edit.apply(state.moment_1),
+        moment_2: edit.apply(state.moment_2),
+        max_moment_2: state.max_moment_2.map(|moment| edit.apply(moment)),
+    }
+}

@@ -1,0 +1,194 @@
+//! The optimiser of one field, with the state that it owns.
+
+use std::collections::BTreeMap;
+
+use burn::optim::{RecordState, StateSink, StateSource};
+use burn::tensor::{Device, Tensor, TensorData};
+use burn_pack::Scalar;
+
+use super::edit::{MomentEdit, RowOptimizer};
+
+/// State that a run saves and goes on from: of an optimiser, a strategy, a module.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct StateRecord {
+    /// Tensors by name.
+    pub tensors: BTreeMap<String, TensorData>,
+    /// Numbers by name.
+    pub scalars: BTreeMap<String, Scalar>,
+}
+
+impl StateRecord {
+    /// The entries of each name before the first dot: the tensor of that name alone, and what is under it.
+    pub(crate) fn by_field(self) -> BTreeMap<String, (Option<TensorData>, StateRecord)> {
+        let mut fields: BTreeMap<String, (Option<TensorData>, Self)> = BTreeMap::new();
+        for (name, data) in self.tensors {
+            match name.split_once('.') {
+                Some((field, leaf)) => {
+                    let (_, state) = fields.entry(field.to_owned()).or_default();
+                    state.tensors.insert(leaf.to_owned(), data);
+                }
+                None => fields.entry(name).or_default().0 = Some(data),
+            }
+        }
+        for (name, value) in self.scalars {
+            let (field, leaf) = name.split_once('.').unwrap_or((&name, ""));
+            let (_, state) = fields.entry(field.to_owned()).or_default();
+            state.scalars.insert(leaf.to_owned(), value);
+        }
+        fields
+    }
+
+    /// Takes out everything under a name, which is cut from it: `model.means` under `model` is `means`.
+    pub fn take_under(&mut self, name: &str) -> Self {
+        let is_under = |key: &str| {
+            key.strip_prefix(name)
+                .is_some_and(|rest| rest.starts_with('.'))
+        };
+        let cut = |key: String| key[name.len() + 1..].to_owned();
+        let (tensors, scalars) = (
+            core::mem::take(&mut self.tensors),
+            core::mem::take(&mut self.scalars),
+        );
+        let mut under = Self::default();
+        for (key, data) in tensors {
+            match is_under(&key) {
+                true => under.tensors.insert(cut(key), data),
+                false => self.tensors.insert(key, data),
+            };
+        }
+        for (key, value) in scalars {
+            match is_under(&key) {
+                true => under.scalars.insert(cut(key), value),
+                false => self.scalars.insert(key, value),
+            };
+        }
+        under
+    }
+
+    /// Puts everything of another record under a name, which [`take_under`](Self::take_under) takes out again.
+    pub fn put_under(&mut self, name: &str, other: Self) {
+        let under = |key: String| format!("{name}.{key}");
+        self.tensors.extend(
+            other
+                .tensors
+                .into_iter()
+                .map(|(key, data)| (under(key), data)),
+        );
+        self.scalars.extend(
+            other
+                .scalars
+                .into_iter()
+                .map(|(key, value)| (under(key), value)),
+        );
+    }
+}
+
+/// Steps one field and edits its moments: a [`RowOptimizer`] and its state, without their types.
+pub struct FieldOptimizer(Box<dyn Erased>);
+
+impl core::fmt::Debug for FieldOptimizer {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.debug_struct("FieldOptimizer").finish_non_exhaustive()
+    }
+}
+
+impl<O: RowOptimizer> From<O> for FieldOptimizer {
+    fn from(optimizer: O) -> Self {
+        Self(Box::new(Owner {
+            optimizer,
+            state: None,
+        }))
+    }
+}
+
+impl FieldOptimizer {
+    /// The value `[N, width]` after a step along the gradient of the same shape.
+    pub fn step(&mut self, rate: f64, value: Tensor<2>, gradient: Tensor<2>) -> Tensor<2> {
+        self.0.step(rate, value, gradient)
+    }
+
+    /// Lets the moments follow an edit of rows.
+    pub fn edit_rows(&mut self, edit: &MomentEdit) {
+        self.0.edit_rows(edit);
+    }
+
+    /// The state, on the host; empty before the first step.
+    pub fn save(&self) -> StateRecord {
+        self.0.save()
+    }
+
+    /// Puts back what [`save`](Self::save) gave, for a value of this shape.
+    ///
+    /// # Errors
+    /// What is missing, where it is another optimiser's.
+    pub fn restore(
+        &mut self,
+        record: StateRecord,
+        shape: [usize; 2],
+        device: &Device,
+    ) -> Result<(), String> {
+        self.0.restore(record, shape, device)
+    }
+}
+
+trait Erased: Send {
+    fn step(&mut self, rate: f64, value: Tensor<2>, gradient: Tensor<2>) -> Tensor<2>;
+    fn edit_rows(&mut self, edit: &MomentEdit);
+    fn save(&self) -> StateRecord;
+    fn restore(
+        &mut self,
+        record: StateRecord,
+        shape: [usize; 2],
+        device: &Device,
+    ) -> Result<(), String>;
+}
+
+struct Owner<O: RowOptimizer> {
+    optimizer: O,
+    state: Option<O::State<2>>,
+}
+
+impl<O: RowOptimizer> Erased for Owner<O> {
+    fn step(&mut self, rate: f64, value: Tensor<2>, gradient: Tensor<2>) -> Tensor<2> {
+        let (value, state) = self
+            .optimizer
+            .step(rate, value, gradient, self.state.take());
+        self.state = state;
+        value
+    }
+
+    fn edit_rows(&mut self, edit: &MomentEdit) {
+        self.state = self.state.take().map(|state| O::edit_rows(state, edit));
+    }
+
+    fn save(&self) -> StateRecord {
+        let mut sink = StateSink::default();
+        if let Some(state) = &self.state {
+            state.state_flatten("", &mut sink);
+        }
+        StateRecord {
+            tensors: sink.tensors.into_iter().collect(),
+            scalars: sink.scalars.into_iter().collect(),
+        }
+    }
+
+    fn restore(
+        &mut self,
+        record: StateRecord,
+        shape: [usize; 2],
+        device: &Device,
+    ) -> Result<(), String> {
+        if record == StateRecord::default() {
+            self.state = None;
+            return Ok(());
+        }
+        O::check_state(&record, shape)?;
+        let mut source = StateSource::new(record.scalars);
+        for (name, data) in record.tensors {
+            source.insert_tensor(name, data);
+        }
+        let state = O::State::<2>::state_unflatten("", &mut source, device);
+        self.state = Some(state.ok_or("the state of another optimiser")?);
+        Ok(())
+    }
+}

@@ -1,0 +1,16 @@
+//! Optimisers whose moments follow the rows of a parameter when a strategy adds, removes or reorders them.
+//!
+//! A [`FieldOptimizer`] owns the state of one field. Fields are stepped as `[N, width]` tensors whatever their rank, which
+//! costs nothing (a reshape is no copy) and changes no number of an element-wise optimiser.
+
+mod adam;
+mod edit;
+mod field_optimizer;
+#[cfg(all(test, feature = "cpu"))]
+mod tests;
+mod through_host;
+
+pub use adam::{SplatAdam, SplatAdamState};
+pub use edit::{MomentEdit, RowOptimizer};
+pub use field_optimizer::{FieldOptimizer, StateRecord};
+pub use through_host::ThroughHost;

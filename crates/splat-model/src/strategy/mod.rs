@@ -1,0 +1,212 @@
+//! Strategies: which Gaussians a scene needs, and what else may change while it is trained.
+//!
+//! A [`Strategy`] is given to the trainer and called around every step of the optimiser. It sees gradients, parameters and
+//! rows, and may edit rows ([`RowEdit`](crate::RowEdit)), add terms to the loss, pause and scale the steps of fields, set the
+//! first Gaussians and the size of the photos, and render other training views. [`Adc`] is that of 3DGS.
+
+mod adc;
+mod relocation;
+mod schedule;
+mod scores;
+
+use burn::tensor::{Device, Tensor};
+use splat_ops::{OpError, Projected, Rendered};
+
+use crate::field::Field;
+use crate::optimizer::StateRecord;
+use crate::{
+    CameraTensors, FieldGradients, FieldStep, InitSettings, Optimized, RenderSettings, SplatModel,
+};
+
+pub use adc::{Adc, AdcSettings};
+pub use relocation::relocate;
+pub use schedule::{RunSchedule, StepInfo};
+pub use scores::weighted_contributions;
+
+/// What a strategy wants to know of the screen in a step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[non_exhaustive]
+pub struct ScreenWants {
+    /// Gradients of the packed screen splats, which cost a probe in the graph.
+    pub gradients: bool,
+}
+
+impl ScreenWants {
+    /// Nothing.
+    pub fn nothing() -> Self {
+        Self::default()
+    }
+
+    /// The gradients of the screen splats.
+    pub fn gradients() -> Self {
+        Self { gradients: true }
+    }
+}
+
+/// What a training view of a step left on the screen.
+#[derive(Debug)]
+pub struct ScreenView {
+    /// The splats.
+    pub projected: Projected,
+    /// Gradient `[C, N, 9]` of their packed rows, where the strategy wanted it.
+    pub gradient: Option<Tensor<3>>,
+}
+
+/// A rendered training view, before the backward pass.
+#[derive(Debug)]
+pub struct Pass<'a, M> {
+    /// The step, counted from 0.
+    pub at: StepInfo,
+    /// The model.
+    pub model: &'a M,
+    /// Its splats on the screen.
+    pub projected: &'a Projected,
+    /// The picture.
+    pub rendered: &'a Rendered,
+}
+
+/// What a strategy may see and change around a step of the optimiser.
+pub struct StepContext<'a, M> {
+    /// How many steps are done: before the optimiser, those before this step; after it, this one too.
+    pub at: StepInfo,
+    /// The model and its optimisers; rows are edited here.
+    pub model: &'a mut Optimized<M>,
+    /// Gradients of the fields; empty after the step.
+    pub gradients: &'a mut FieldGradients,
+    /// The training views of the step; empty after it.
+    pub screen: &'a [ScreenView],
+    /// How the model is rendered in this run, at its highest degree of spherical harmonics.
+    pub settings: RenderSettings,
+    /// All training views, to render others than those of the step.
+    pub views: &'a dyn TrainingViews,
+}
+
+/// The views that a run trains on.
+pub trait TrainingViews {
+    /// How many there are.
+    fn count(&self) -> usize;
+
+    /// The camera of a view, relative to the model's origin.
+    fn camera(&self, view: usize) -> CameraTensors;
+
+    /// The photo of a view, `[1, H, W, 3]` in [0, 1].
+    fn photo(&self, view: usize) -> Tensor<4>;
+}
+
+/// What a change of rows did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Refinement {
+    /// Gaussians that were duplicated.
+    pub cloned: usize,
+    /// Gaussians that were replaced by two smaller ones.
+    pub split: usize,
+    /// Gaussians that were removed.
+    pub pruned: usize,
+    /// Gaussians that were moved to where others are.
+    pub relocated: usize,
+    /// Whether opacities were reset.
+    pub reset: bool,
+}
+
+/// Density control and whatever else changes a run from outside of its loss. Every method but
+/// [`after_step`](Self::after_step) has a default that changes nothing.
+///
+/// ```
+/// use splat_model::strategy::{Refinement, StepContext, Strategy};
+/// use splat_model::{RowEdit, SplatModel};
+/// use splat_model::ops::OpError;
+///
+/// /// Removes what is nearly transparent every hundred steps, and never adds anything.
+/// struct Prune;
+///
+/// impl<M: SplatModel> Strategy<M> for Prune {
+///     fn after_step(&mut self, context: &mut StepContext<M>) -> Result<Option<Refinement>, OpError> {
+///         if !context.at.step.is_multiple_of(100) {
+///             return Ok(None);
+///         }
+///         let [logits] = context.model.read(["opacity_logits"])?;
+///         let mut edit = RowEdit::identity(logits.len());
+///         edit.retain(|row| logits[row] > -5.0);
+///         let pruned = logits.len() - edit.len();
+///         if pruned > 0 && !edit.is_empty() {
+///             context.model.edit_rows(&edit)?;
+///         }
+///         Ok(Some(Refinement { pruned, ..Refinement::default() }))
+///     }
+/// }
+/// ```
+pub trait Strategy<M: SplatModel>: Send {
+    /// What a checkpoint calls it: a run goes on with the strategy that it was begun with. Default: the type's name.
+    fn name(&self) -> String {
+        core::any::type_name::<Self>().to_owned()
+    }
+
+    /// The settings of the first Gaussians, given those of the run.
+    fn first_gaussians(&self, settings: &InitSettings) -> InitSettings {
+        settings.clone()
+    }
+
+    /// By what photos are divided at a step, if not by what the run's settings say.
+    fn photo_factor(&self, _at: &StepInfo) -> Option<u32> {
+        None
+    }
+
+    /// What of the screen is wanted at a step.
+    fn screen_wants(&self, _at: &StepInfo) -> ScreenWants {
+        ScreenWants::nothing()
+    }
+
+    /// Names of the terms that [`loss_terms`](Self::loss_terms) adds to the loss.
+    fn loss_term_names(&self) -> &'static [&'static str] {
+        &[]
+    }
+
+    /// Terms added to the loss, each `[1]`, its weight in it: one for each name.
+    ///
+    /// # Errors
+    /// As those of the ops that it uses.
+    fn loss_terms(&self, _pass: &Pass<M>) -> Result<Vec<Tensor<1>>, OpError> {
+        Ok(Vec::new())
+    }
+
+    /// What the optimiser does with a field at a step.
+    fn field_step(&self, _at: &StepInfo, _field: &Field) -> FieldStep {
+        FieldStep::Step(1.0)
+    }
+
+    /// Called after the backward pass and before the optimiser: gradients may be read and changed.
+    ///
+    /// # Errors
+    /// As those of the ops that it uses.
+    fn before_step(&mut self, _context: &mut StepContext<M>) -> Result<(), OpError> {
+        Ok(())
+    }
+
+    /// Called after the optimiser, but for the last step of a run: what it would add would never be trained. Returns what
+    /// was done where it was time to do something.
+    ///
+    /// # Errors
+    /// As those of the ops that it uses.
+    fn after_step(&mut self, context: &mut StepContext<M>) -> Result<Option<Refinement>, OpError>;
+
+    /// What a checkpoint must keep of it.
+    ///
+    /// # Errors
+    /// When the device fails.
+    fn save(&self) -> Result<StateRecord, OpError> {
+        Ok(StateRecord::default())
+    }
+
+    /// Puts back what [`save`](Self::save) gave, for a model of `rows` Gaussians.
+    ///
+    /// # Errors
+    /// What is wrong with it, in a line.
+    fn restore(
+        &mut self,
+        _record: StateRecord,
+        _rows: usize,
+        _device: &Device,
+    ) -> Result<(), String> {
+        Ok(())
+    }
+}

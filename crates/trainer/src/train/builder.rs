@@ -1,0 +1,330 @@
+//! How a run is described before it begins.
+
+use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
+use std::sync::mpsc::Receiver;
+use std::time::{Duration, Instant};
+
+use burn::tensor::Device;
+use splat_data::{Capture, SceneScale, SplatData, View};
+use splat_model::optimizer::{FieldOptimizer, SplatAdam};
+use splat_model::strategy::{Adc, RunSchedule, Strategy};
+use splat_model::{Field, Gaussians, Optimized, SplatModel};
+
+use super::checkpoint::RunRecord;
+use super::commands::{Command, Commands};
+use super::fingerprint::Fingerprint;
+use super::first::{default_max_gaussians, first_gaussians};
+use super::hooks::{Hook, Hooks};
+use super::loss_log::LossLog;
+use super::state::State;
+use super::trainer::Trainer;
+use super::{
+    Checkpoint, CheckpointError, History, IntoLoss, LossTerms, Progress, TrainConfig, TrainError,
+    Warning, coarse, views,
+};
+
+type MakeModel<M> = dyn FnOnce(&SplatData, &Device) -> M + Send;
+type MakeOptimizer = dyn Fn(&Field) -> Option<FieldOptimizer> + Send;
+/// Puts a checkpoint where it outlives the process.
+type SaveCheckpoint = dyn FnMut(&Checkpoint) -> Result<(), CheckpointError> + Send;
+
+/// Builds a [`Trainer`].
+pub struct TrainerBuilder<M: SplatModel = Gaussians> {
+    capture: Arc<Capture>,
+    config: TrainConfig,
+    device: Device,
+    model: Box<MakeModel<M>>,
+    strategy: Option<Box<dyn Strategy<M>>>,
+    optimizer: Box<MakeOptimizer>,
+    hooks: Hooks,
+    loss: Option<LossTerms>,
+    resume: Option<Checkpoint>,
+    watch: Watch,
+}
+
+/// Who watches a run, and what is kept of it on the way.
+pub(super) struct Watch {
+    pub(super) interrupt: Arc<AtomicBool>,
+    pub(super) commands: Commands,
+    pub(super) evaluate_every: Option<usize>,
+    pub(super) autosave: Option<Autosave>,
+    pub(super) on_progress: Box<dyn FnMut(Progress) + Send>,
+    pub(super) on_warning: Box<dyn FnMut(&Warning) + Send>,
+}
+
+/// Keeps the state of a run from time to time.
+pub(super) struct Autosave {
+    pub(super) every: Duration,
+    pub(super) last: Instant,
+    pub(super) save: Box<SaveCheckpoint>,
+    /// Kinds of failure that were told.
+    pub(super) failures: Vec<String>,
+}
+
+impl TrainerBuilder {
+    pub(super) fn new(capture: Arc<Capture>) -> Self {
+        Self {
+            capture,
+            config: TrainConfig::default(),
+            device: Device::default(),
+            model: Box::new(Gaussians::from_data),
+            strategy: None,
+            optimizer: Box::new(|_| None),
+            hooks: Hooks::default(),
+            loss: None,
+            resume: None,
+            watch: Watch {
+                interrupt: Arc::default(),
+                commands: Commands::new(None),
+                evaluate_every: None,
+                autosave: None,
+                on_progress: Box::new(|_| {}),
+                on_warning: Box::new(|_| {}),
+            },
+        }
+    }
+
+    /// Trains another model than [`Gaussians`], made of the first Gaussians on a device. To be called before
+    /// [`strategy`](TrainerBuilder::strategy), whose type follows from it.
+    pub fn model<M: SplatModel>(
+        self,
+        make: impl FnOnce(&SplatData, &Device) -> M + Send + 'static,
+    ) -> TrainerBuilder<M> {
+        TrainerBuilder {
+            capture: self.capture,
+            config: self.config,
+            device: self.device,
+            model: Box::new(make),
+            strategy: None,
+            optimizer: self.optimizer,
+            hooks: self.hooks,
+            loss: self.loss,
+            resume: self.resume,
+            watch: self.watch,
+        }
+    }
+}
+
+impl<M: SplatModel> TrainerBuilder<M> {
+    /// Settings; the defaults are those of gsplat.
+    pub fn config(mut self, config: TrainConfig) -> Self {
+        self.config = config;
+        self
+    }
+
+    /// Where to compute. Default: Burn's default device.
+    pub fn device(mut self, device: Device) -> Self {
+        self.device = device;
+        self
+    }
+
+    /// Which Gaussians there are, and what else changes from step to step. Default: [`Adc`] with the settings'
+    /// `density`.
+    pub fn strategy(mut self, strategy: impl Strategy<M> + 'static) -> Self {
+        self.strategy = Some(Box::new(strategy));
+        self
+    }
+
+    /// The optimiser of each field for which this gives one; the others have [`SplatAdam`].
+    pub fn optimizer(
+        mut self,
+        optimizer: impl Fn(&Field) -> Option<FieldOptimizer> + Send + 'static,
+    ) -> Self {
+        self.optimizer = Box::new(optimizer);
+        self
+    }
+
+    /// Adds something that is trained beside the model.
+    pub fn hook(mut self, hook: impl Hook) -> Self {
+        self.hooks.0.push(Box::new(hook));
+        self
+    }
+
+    /// What to minimise: a closure `|view, rendered| -> Result<Tensor<1>, OpError>` or
+    /// [`LossTerms`]. Default: [`LossTerms::l1_ssim`].
+    pub fn loss(mut self, loss: impl IntoLoss) -> Self {
+        self.loss = Some(loss.into_loss());
+        self
+    }
+
+    /// The run ends after the step during which this becomes true.
+    pub fn interrupt(mut self, flag: Arc<AtomicBool>) -> Self {
+        self.watch.interrupt = flag;
+        self
+    }
+
+    /// The run does what it is told here between its steps, see [`command_queue`](super::command_queue).
+    pub fn commands(mut self, commands: Receiver<Command>) -> Self {
+        self.watch.commands = Commands::new(Some(commands));
+        self
+    }
+
+    /// Goes on from a checkpoint instead of the capture's points. The capture must be that of the checkpoint, and so
+    /// must the settings, see [`Checkpoint::check_settings`].
+    pub fn resume(mut self, checkpoint: Checkpoint) -> Self {
+        self.resume = Some(checkpoint);
+        self
+    }
+
+    /// Measures held-out PSNR every so many steps, for the curves. Default: never.
+    pub fn evaluate_every(mut self, steps: usize) -> Self {
+        self.watch.evaluate_every = Some(steps.max(1));
+        self
+    }
+
+    /// Calls `save` every so often, so that a crash loses no more than that much time. When it fails the run goes on
+    /// with a warning, one for each kind of failure. Default: never.
+    pub fn autosave(
+        mut self,
+        every: Duration,
+        save: impl FnMut(&Checkpoint) -> Result<(), CheckpointError> + Send + 'static,
+    ) -> Self {
+        self.watch.autosave = Some(Autosave {
+            every,
+            last: Instant::now(),
+            save: Box::new(save),
+            failures: Vec::new(),
+        });
+        self
+    }
+
+    /// Called after every step.
+    pub fn on_progress(mut self, callback: impl FnMut(Progress) + Send + 'static) -> Self {
+        self.watch.on_progress = Box::new(callback);
+        self
+    }
+
+    /// Called when something looks wrong; [`History::warnings`] keeps what is wrong with the run itself.
+    pub fn on_warning(mut self, callback: impl FnMut(&Warning) + Send + 'static) -> Self {
+        self.watch.on_warning = Box::new(callback);
+        self
+    }
+
+    /// Checks everything and makes the first Gaussians.
+    ///
+    /// # Errors
+    /// When there is nothing in the capture to train on, a setting is out of range, the model, the strategy or a hook
+    /// cannot be used, or the checkpoint to resume from is another run's.
+    pub fn build(mut self) -> Result<Trainer<M>, TrainError> {
+        if let Some(problem) = self.config.problem() {
+            return Err(TrainError::Config(problem));
+        }
+        self.capture.check_trainable()?;
+        check_hook_names(&self.hooks)?;
+        let loss = self.loss.take();
+        let loss = loss.unwrap_or_else(|| LossTerms::l1_ssim(self.config.ssim_weight));
+        let schedule = schedule(&self.capture, &self.config)?;
+        let device = self.device.without_autodiff().autodiff();
+        let mut record = RunRecord {
+            capture: Fingerprint::of(&self.capture),
+            config: self.config.clone(),
+            changes: Vec::new(),
+        };
+        let mut config = self.config;
+        let most = config.density.max_gaussians;
+        config.density.max_gaussians = most.or_else(|| Some(default_max_gaussians(&self.capture)));
+        let strategy = self.strategy.take();
+        let strategy = strategy.unwrap_or_else(|| Box::new(Adc::new(config.density.clone())));
+        let terms = loss
+            .names()
+            .chain(strategy.loss_term_names().iter().copied());
+        let terms: Vec<String> = terms.map(str::to_owned).collect();
+
+        let resumed = self.resume.take();
+        if let Some(checkpoint) = &resumed {
+            let views = checkpoint.check_run(&record, &terms, &strategy.name())?;
+            if !views.is_empty() {
+                (self.watch.on_warning)(&Warning::PhotosChanged { views });
+            }
+            record.changes = checkpoint.changes_with(&record.config);
+        }
+        let origin = match &resumed {
+            Some(checkpoint) => checkpoint.origin(),
+            None => {
+                let cameras: Vec<_> = self.capture.views.iter().map(View::camera).collect();
+                schedule.scene_scale.origin(&cameras)
+            }
+        };
+        let init = strategy.first_gaussians(&config.init);
+        let splats = first_gaussians(&self.capture, &init, schedule.scene_scale, origin)?;
+        let model = (self.model)(&splats, &device);
+        let model = optimized(model, &config, schedule.scene_scale, &self.optimizer)?;
+        let mut state = State {
+            model,
+            strategy,
+            hooks: self.hooks,
+            history: History {
+                terms,
+                ..History::default()
+            },
+            step: 0,
+            elapsed: Duration::ZERO,
+        };
+        if let Some(checkpoint) = resumed {
+            checkpoint.restore(&mut state, &device)?;
+        }
+        if state.history.counts.is_empty() {
+            let count = state.model.model().count();
+            state.history.counts.push((0, count));
+        }
+        Ok(Trainer {
+            views: views::ViewOrder::new(config.seed, self.capture.split.train.len()),
+            capture: self.capture,
+            config,
+            device,
+            loss,
+            schedule,
+            watch: self.watch,
+            state,
+            record,
+            losses: LossLog::default(),
+            coarse: coarse::CoarseViews::default(),
+        })
+    }
+}
+
+/// Length, scene size and seed of the run.
+fn schedule(capture: &Capture, config: &TrainConfig) -> Result<RunSchedule, TrainError> {
+    let cameras: Vec<_> = capture.views.iter().map(View::camera).collect();
+    let points: Vec<[f64; 3]> = capture.points.iter().map(|point| point.position).collect();
+    let scene_scale = SceneScale::of_capture(&cameras, &points);
+    if !scene_scale.is_in_range() {
+        return Err(TrainError::SceneSize {
+            capture: capture.root.clone(),
+            size: scene_scale.length(),
+        });
+    }
+    Ok(RunSchedule {
+        steps: config.steps,
+        scene_scale,
+        seed: config.seed,
+    })
+}
+
+/// The model with an optimiser for each of its fields.
+fn optimized<M: SplatModel>(
+    model: M,
+    config: &TrainConfig,
+    scene: SceneScale,
+    optimizer: &MakeOptimizer,
+) -> Result<Optimized<M>, TrainError> {
+    let fields = model.fields(&config.rates);
+    let usual = |field: &Field| SplatAdam::of_field(field, config.adam_rows(), scene).into();
+    let optimizer = |field: &Field| optimizer(field).unwrap_or_else(|| usual(field));
+    Optimized::new(model, fields, optimizer).map_err(|error| TrainError::Setup(error.to_string()))
+}
+
+/// Names under which checkpoints keep hooks.
+fn check_hook_names(hooks: &Hooks) -> Result<(), TrainError> {
+    for (index, hook) in hooks.0.iter().enumerate() {
+        let name = hook.name();
+        let twice = hooks.0[..index].iter().any(|other| other.name() == name);
+        if twice || name.is_empty() || name.contains('.') {
+            return Err(TrainError::Setup(format!(
+                "hook {index} (counted from 0) is named `{name}`; a name must be its own, not empty, and without a dot"
+            )));
+        }
+    }
+    Ok(())
+}

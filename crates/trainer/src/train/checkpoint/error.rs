@@ -1,0 +1,73 @@
+//! Why a checkpoint cannot be written or used.
+
+use std::path::PathBuf;
+
+/// Why a checkpoint cannot be written or used.
+#[derive(Debug, thiserror::Error)]
+pub enum CheckpointError {
+    /// Reading or writing failed.
+    #[error("{path}: {source}")]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Not a checkpoint of this program, or damaged.
+    #[error("{path}: not a usable checkpoint: {reason}")]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        reason: String,
+    },
+    /// The checkpoint of a run on another capture.
+    #[error(
+        "{path}: the run was begun on another capture (`{name}`): {difference}; give the capture it was begun on, or begin another run in another folder"
+    )]
+    OtherCapture {
+        /// The file.
+        path: PathBuf,
+        /// Name of the run's capture.
+        name: String,
+        /// What differs, the first thing.
+        difference: String,
+    },
+    /// The checkpoint of a run with other settings.
+    #[error(
+        "{path}: the run was begun with {difference}; leave that out to go on with the run's settings, or begin another run in another folder"
+    )]
+    OtherSettings {
+        /// The file.
+        path: PathBuf,
+        /// Every such setting, with the two values.
+        difference: String,
+    },
+    /// Nothing would be left to train.
+    #[error(
+        "{path}: {done} of the run's {steps} steps are done; {wanted} would leave nothing to train, ask for more than {done}"
+    )]
+    NothingLeft {
+        /// The file.
+        path: PathBuf,
+        /// Steps done.
+        done: usize,
+        /// Steps of the run.
+        steps: usize,
+        /// Steps asked for.
+        wanted: usize,
+    },
+    /// The state could not be read back from the device, or holds what no checkpoint has a place for.
+    #[error("the state of the run cannot be saved: {0}")]
+    State(String),
+}
+
+impl CheckpointError {
+    /// What failures of one kind share, so that a kind is told once.
+    pub(in super::super) fn kind(&self) -> String {
+        match self {
+            Self::Io { path, source } => format!("{} {:?}", path.display(), source.kind()),
+            other => other.to_string(),
+        }
+    }
+}

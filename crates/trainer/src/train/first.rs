@@ -1,0 +1,39 @@
+//! The first Gaussians of a run.
+
+use splat_data::{Capture, SceneScale, SplatData};
+use splat_model::{InitSettings, splats_from_points};
+
+use super::TrainError;
+
+/// How many Gaussians are worth their time where no setting says it: seven for every ten pixels of a photo, or one for
+/// every hundred of all photos that are trained on, whichever is more.
+pub(super) fn default_max_gaussians(capture: &Capture) -> usize {
+    let pixels = |view: &usize| {
+        let view = &capture.views[*view];
+        view.width as usize * view.height as usize
+    };
+    let photos = capture.split.train.iter().map(pixels);
+    (photos.clone().sum::<usize>() / 100).max(photos.max().unwrap_or(0) * 7 / 10)
+}
+
+/// One Gaussian per point of the capture, relative to the origin.
+pub(super) fn first_gaussians(
+    capture: &Capture,
+    settings: &InitSettings,
+    scale: SceneScale,
+    origin: [f64; 3],
+) -> Result<SplatData, TrainError> {
+    let points = &capture.points;
+    let positions: Vec<_> = points
+        .iter()
+        .map(|p| std::array::from_fn(|axis| (p.position[axis] - origin[axis]) as f32))
+        .collect();
+    let colors: Vec<_> = points.iter().map(|p| p.color).collect();
+    let splats = splats_from_points(&positions, &colors, scale, settings);
+    let mut splats = splats.map_err(|source| TrainError::Init {
+        capture: capture.root.clone(),
+        source,
+    })?;
+    splats.origin = origin;
+    Ok(splats)
+}

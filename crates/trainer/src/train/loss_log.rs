@@ -1,0 +1,99 @@
+//! Losses that are still on the device, and their way into the history.
+
+use burn::tensor::{Tensor, Transaction};
+use splat_ops::OpError;
+
+use super::{LossRecord, TrainError};
+
+/// Losses are read back from the device in batches of this many steps.
+pub const LOSS_BATCH: usize = 10;
+
+/// A run ends after this many steps in a row without a finite loss: no single photo is the cause then.
+const NOT_FINITE_LIMIT: usize = 100;
+
+/// A loss on the device.
+pub(super) struct UnreadLoss {
+    /// The step, from 1.
+    pub(super) step: usize,
+    /// Index of its first view in the capture.
+    pub(super) view: usize,
+    /// Total, then the terms.
+    pub(super) values: Vec<Tensor<1>>,
+}
+
+/// Losses not read yet.
+#[derive(Default)]
+pub(super) struct LossLog {
+    unread: Vec<UnreadLoss>,
+}
+
+/// What a loss that was read turned out to be.
+pub(super) enum ReadLoss {
+    Finite(LossRecord),
+    /// Its step, its view, its value.
+    NotFinite(usize, usize, f32),
+}
+
+impl LossLog {
+    pub(super) fn push(&mut self, loss: UnreadLoss) {
+        self.unread.push(loss);
+    }
+
+    /// Whether as many wait as one transfer takes.
+    pub(super) fn is_full(&self) -> bool {
+        self.unread.len() >= LOSS_BATCH
+    }
+
+    /// Reads all that wait, of a total and `terms` terms each, in one transfer.
+    pub(super) fn read(&mut self, terms: usize) -> Result<Vec<ReadLoss>, OpError> {
+        let unread = core::mem::take(&mut self.unread);
+        if unread.is_empty() {
+            return Ok(Vec::new());
+        }
+        let values = unread.iter().flat_map(|loss| loss.values.clone());
+        let read = values.fold(Transaction::default(), Transaction::register);
+        let read = read.try_execute().map_err(|error| OpError::Device {
+            op: "training step",
+            what: error.to_string(),
+        })?;
+        let values: Vec<f32> = read
+            .into_iter()
+            .map(|data| data.convert::<f32>())
+            .flat_map(|data| data.try_into_vec::<f32>().unwrap_or_default())
+            .collect();
+        let losses = unread.iter().zip(values.chunks(1 + terms));
+        Ok(losses
+            .map(|(loss, values)| match values[0].is_finite() {
+                true => ReadLoss::Finite(LossRecord {
+                    step: loss.step,
+                    total: values[0],
+                    terms: values[1..].to_vec(),
+                }),
+                false => ReadLoss::NotFinite(loss.step, loss.view, values[0]),
+            })
+            .collect())
+    }
+}
+
+/// Checks how long losses have not been finite.
+///
+/// # Errors
+/// [`TrainError::NotFinite`] after 100 steps in a row, or all of a shorter run.
+pub(super) fn check_finite(
+    step: usize,
+    view: &str,
+    value: f32,
+    last_finite: Option<&LossRecord>,
+    steps: usize,
+) -> Result<(), TrainError> {
+    let in_a_row = step - last_finite.map_or(0, |record| record.step);
+    if in_a_row < NOT_FINITE_LIMIT.min(steps) {
+        return Ok(());
+    }
+    Err(TrainError::NotFinite {
+        step,
+        view: view.to_owned(),
+        value,
+        in_a_row,
+    })
+}

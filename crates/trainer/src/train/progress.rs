@@ -1,0 +1,80 @@
+//! What a run shows and leaves.
+
+use std::any::Any;
+use std::time::Duration;
+
+use splat_data::{SceneSettings, SplatData};
+use splat_model::{Gaussians, RenderSettings, SplatModel};
+
+use super::checkpoint::RunRecord;
+use super::hooks::Hook;
+use super::state::State;
+use super::{Checkpoint, CheckpointError, History};
+
+/// Where a run stands, for whoever shows it.
+#[derive(Debug, Clone, Copy)]
+pub struct Progress<'a> {
+    /// Steps done.
+    pub step: usize,
+    /// Steps of the whole run.
+    pub steps: usize,
+    /// Number of Gaussians.
+    pub gaussians: usize,
+    /// What was logged so far; losses lag behind by up to [`LOSS_BATCH`](super::LOSS_BATCH) steps.
+    pub history: &'a History,
+}
+
+/// What a run leaves.
+pub struct Trained<M: SplatModel = Gaussians> {
+    /// The model, without autodiff.
+    pub model: M,
+    /// What was logged.
+    pub history: History,
+    /// How to render the model as it was trained, at its highest degree of spherical harmonics.
+    pub render_settings: RenderSettings,
+    /// Steps done; fewer than asked for when interrupted.
+    pub steps: usize,
+    /// Time spent in steps, over all sessions of the run.
+    pub elapsed: Duration,
+    /// How the scene must be rendered to look as it did in training.
+    pub settings: SceneSettings,
+    /// As it was trained, with the optimisers' state.
+    pub(super) state: State<M>,
+    pub(super) run: RunRecord,
+}
+
+impl<M: SplatModel> Trained<M> {
+    /// The scene, with the settings that it must be rendered with.
+    pub fn to_data(&self) -> SplatData {
+        SplatData {
+            settings: self.settings.clone(),
+            ..self.model.to_data()
+        }
+    }
+
+    /// The state to resume from. It is as large again as the scene, and the optimisers' moments twice that.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn checkpoint(&self) -> Result<Checkpoint, CheckpointError> {
+        Checkpoint::of(&self.state, &self.run)
+    }
+
+    /// The first hook of this type, as training left it.
+    pub fn hook<H: Hook>(&self) -> Option<&H> {
+        let hooks = self.state.hooks.0.iter();
+        hooks
+            .map(|hook| -> &dyn Any { hook.as_ref() })
+            .find_map(|hook| hook.downcast_ref())
+    }
+}
+
+impl<M: SplatModel> std::fmt::Debug for Trained<M> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Trained")
+            .field("gaussians", &self.model.count())
+            .field("steps", &self.steps)
+            .field("elapsed", &self.elapsed)
+            .finish_non_exhaustive()
+    }
+}

@@ -1,0 +1,181 @@
+//! A run from its first step to its last: what is watched, measured and kept on the way.
+
+use splat_data::{Capture, SceneSettings};
+use splat_model::SplatModel;
+use splat_ops::SH_DEGREE_MAX;
+
+use super::commands::{Next, Snapshot};
+use super::trainer::Trainer;
+use super::{Checkpoint, Progress, TrainError, Trained, Warning, views, warnings};
+use crate::evaluate::evaluate_with;
+
+impl<M: SplatModel> Trainer<M> {
+    /// Runs to the last step, or until interrupted.
+    ///
+    /// A gradient that is not finite never reaches the optimiser (see
+    /// [`SplatAdam`](splat_model::optimizer::SplatAdam)), so a step whose loss is not is a warning, and an error only when
+    /// many come in a row.
+    ///
+    /// # Errors
+    /// When the loss is not finite for 100 steps in a row, or for the whole of a shorter run, or an op refuses what it is
+    /// given.
+    pub fn run(mut self) -> Result<Trained<M>, TrainError> {
+        if self.state.step == 0 {
+            let splats = self.state.model.model().to_data();
+            let found = warnings::start::inspect(&self.capture, &splats, &self.config);
+            found.into_iter().for_each(|warning| self.warn(warning));
+        }
+        if let Err(error) = self.advance() {
+            self.rescue(&error);
+            return Err(error);
+        }
+        Ok(Trained {
+            settings: self.scene_settings(),
+            model: self.state.model.model().valid(),
+            history: self.state.history.clone(),
+            render_settings: self
+                .config
+                .render_settings(SH_DEGREE_MAX, self.schedule.scene_scale),
+            steps: self.state.step,
+            elapsed: self.state.elapsed,
+            state: self.state,
+            run: self.record,
+        })
+    }
+
+    /// Takes the steps that are left, until interrupted or told to stop.
+    fn advance(&mut self) -> Result<(), TrainError> {
+        while self.state.step < self.config.steps {
+            match self.watch.commands.next(&self.watch.interrupt) {
+                Next::Step => self.watched_step()?,
+                Next::Stop => break,
+                Next::Save => {
+                    self.read_losses()?;
+                    self.save();
+                }
+                // Whoever asked may be gone.
+                Next::Snapshot(to) => drop(to.send(self.snapshot())),
+            }
+        }
+        self.read_losses()
+    }
+
+    fn watched_step(&mut self) -> Result<(), TrainError> {
+        self.step()?;
+        let (step, steps) = (self.state.step, self.config.steps);
+        if warnings::course::is_due(step, steps) {
+            self.inspect_losses();
+        }
+        let measures = |every: usize| step == steps || step.is_multiple_of(every);
+        if self.watch.evaluate_every.is_some_and(measures) {
+            self.measure_held_out()?;
+        }
+        self.save_if_due()?;
+        (self.watch.on_progress)(Progress {
+            step,
+            steps,
+            gaussians: self.state.model.model().count(),
+            history: &self.state.history,
+        });
+        Ok(())
+    }
+
+    /// The scene as it is, and how it is to be rendered.
+    pub fn snapshot(&self) -> Snapshot {
+        let mut scene = self.state.model.model().to_data();
+        scene.settings = self.scene_settings();
+        Snapshot {
+            step: self.state.step,
+            scene,
+        }
+    }
+
+    fn scene_settings(&self) -> SceneSettings {
+        SceneSettings {
+            scene_scale: Some(self.schedule.scene_scale.length()),
+            antialias: Some(self.config.antialias),
+            background: Some(self.config.background.unwrap_or_default()),
+            ..SceneSettings::default()
+        }
+    }
+
+    fn save_if_due(&mut self) -> Result<(), TrainError> {
+        let autosave = self.watch.autosave.as_ref();
+        if autosave.is_some_and(|autosave| autosave.last.elapsed() >= autosave.every) {
+            // The losses up to here are part of the checkpoint.
+            self.read_losses()?;
+            self.save();
+        }
+        Ok(())
+    }
+
+    /// Keeps the present state where the run's are kept. Says if it cannot be, and goes on.
+    fn save(&mut self) {
+        let Some(autosave) = &mut self.watch.autosave else {
+            return;
+        };
+        let saved = Checkpoint::of(&self.state, &self.record)
+            .and_then(|checkpoint| (autosave.save)(&checkpoint));
+        autosave.last = std::time::Instant::now();
+        // Training is worth more than what could not be kept of it. Not part of the history: when the run is resumed
+        // it is news again.
+        if let Err(error) = saved
+            && !autosave.failures.contains(&error.kind())
+        {
+            autosave.failures.push(error.kind());
+            (self.watch.on_warning)(&Warning::NotSaved {
+                step: self.state.step,
+                reason: error.to_string(),
+            });
+        }
+    }
+
+    /// Keeps what was done before a step that failed, if there is a place for it. A loss that is not finite is no reason
+    /// to replace a state of before it.
+    fn rescue(&mut self, error: &TrainError) {
+        let diverged = matches!(error, TrainError::NotFinite { .. });
+        if self.state.step > 0 && !diverged {
+            // What cannot be read any more is not what is to be kept.
+            let _ = self.read_losses();
+            self.save();
+        }
+    }
+
+    fn inspect_losses(&mut self) {
+        let course = warnings::course::Course {
+            losses: &self.state.history.losses,
+            step: self.state.step,
+            steps: self.config.steps,
+        };
+        let Capture { views, split, .. } = &*self.capture;
+        let mut order = views::ViewOrder::new(self.config.seed, split.train.len());
+        let name = |view: usize| views[split.train[view]].name.clone();
+        let found = course.inspect(split.train.len(), |step| order.at(step), name);
+        found.into_iter().for_each(|warning| self.warn(warning));
+    }
+
+    /// Says what looks wrong, unless it was said before.
+    pub(super) fn warn(&mut self, warning: Warning) {
+        if let Some(news) = warning.beyond(&self.state.history.warnings) {
+            (self.watch.on_warning)(&news);
+            self.state.history.warnings.push(news);
+        }
+    }
+
+    fn measure_held_out(&mut self) -> Result<(), TrainError> {
+        let held_out: Vec<_> = self.capture.test_views().collect();
+        if held_out.is_empty() {
+            return Ok(());
+        }
+        let settings = self
+            .config
+            .render_settings(SH_DEGREE_MAX, self.schedule.scene_scale);
+        let device = self.device.clone().without_autodiff();
+        let model = self.state.model.model().valid();
+        let hooks = &self.state.hooks;
+        let scores = evaluate_with(&model, &held_out, &settings, &device, hooks, |_, _| {})?;
+        let measured = (self.state.step, scores.psnr);
+        self.state.history.held_out_psnr.push(measured);
+        Ok(())
+    }
+}

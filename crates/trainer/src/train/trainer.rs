@@ -1,0 +1,321 @@
+//! One training step: render, measure the loss, step the optimisers, let the strategy look at it all.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use burn::tensor::{Device, Tensor};
+use splat_data::Capture;
+use splat_model::strategy::{Pass, RunSchedule, ScreenView, ScreenWants, StepContext, StepInfo};
+use splat_model::{
+    CameraTensors, FieldGradients, Gaussians, RenderSettings, SceneScale, SplatModel,
+    project_gaussians, render_projected_on,
+};
+use splat_ops::device::keep_awake;
+use splat_ops::{OpError, Projected, SH_DEGREE_MAX};
+use tracing::trace_span;
+
+use super::builder::Watch;
+use super::checkpoint::RunRecord;
+use super::hooks::{HookView, Purpose};
+use super::loss_log::{LossLog, ReadLoss, UnreadLoss, check_finite};
+use super::state::State;
+use super::training_views::CaptureViews;
+use super::{
+    LossTerms, TargetView, TrainConfig, TrainError, TrainerBuilder, Warning, coarse, views,
+    warnings,
+};
+use crate::photo::levels;
+
+/// A training run.
+pub struct Trainer<M: SplatModel = Gaussians> {
+    pub(super) capture: Arc<Capture>,
+    pub(super) config: TrainConfig,
+    pub(super) device: Device,
+    pub(super) loss: LossTerms,
+    pub(super) schedule: RunSchedule,
+    pub(super) views: views::ViewOrder,
+    pub(super) watch: Watch,
+    pub(super) state: State<M>,
+    pub(super) record: RunRecord,
+    pub(super) losses: LossLog,
+    pub(super) coarse: coarse::CoarseViews,
+}
+
+impl Trainer {
+    /// Begins to describe a run on these photos.
+    pub fn builder(capture: impl Into<Arc<Capture>>) -> TrainerBuilder {
+        TrainerBuilder::new(capture.into())
+    }
+}
+
+/// A view of a step after its loss was measured.
+struct Measured {
+    /// Index of the view in the capture.
+    view: usize,
+    loss: Tensor<1>,
+    terms: Vec<Tensor<1>>,
+    projected: Projected,
+    probe: Option<Tensor<3>>,
+}
+
+impl<M: SplatModel> Trainer<M> {
+    /// Takes the next step of the run, for whoever drives the loop instead of [`run`](Self::run), which also
+    /// watches, measures and keeps what becomes of it.
+    ///
+    /// # Errors
+    /// As those of [`run`](Self::run).
+    pub fn step(&mut self) -> Result<(), TrainError> {
+        let _span = trace_span!("step").entered();
+        let start = Instant::now();
+        keep_awake(&self.device);
+        self.update()?;
+        let inspects = warnings::course::is_due(self.state.step, self.config.steps);
+        if self.losses.is_full() || inspects {
+            self.read_losses()?;
+        }
+        self.state.elapsed += start.elapsed();
+        Ok(())
+    }
+
+    /// Size of the scene, from which every length of the run follows.
+    pub fn scene_scale(&self) -> SceneScale {
+        self.schedule.scene_scale
+    }
+
+    /// The model as it is after the last step.
+    pub fn model(&self) -> &M {
+        self.state.model.model()
+    }
+
+    fn update(&mut self) -> Result<(), TrainError> {
+        let at = StepInfo {
+            step: self.state.step,
+            run: self.schedule,
+        };
+        let wants = self.state.strategy.screen_wants(&at);
+        let count = self.config.views_per_step;
+        let indices = (0..count).map(|i| self.views.at(at.step * count + i));
+        let indices: Vec<usize> = indices.collect();
+        let measured = indices
+            .into_iter()
+            .map(|index| self.measure(index, &at, wants))
+            .collect::<Result<Vec<_>, _>>()?;
+        let (loss, unread, screen) = self.together(measured, &at)?;
+        let mut gradients = trace_span!("backward").in_scope(|| loss.backward());
+        let screen: Vec<ScreenView> = screen
+            .into_iter()
+            .map(|(projected, probe)| ScreenView {
+                projected,
+                gradient: probe.and_then(|probe| probe.grad_remove(&mut gradients)),
+            })
+            .collect();
+        self.state.hooks.step(&mut gradients, &at)?;
+        let mut fields = self.state.model.gradients(&mut gradients);
+        drop(gradients);
+        self.strategy(&at, &mut fields, &screen, Moment::Before)?;
+        // The optimisers need nothing of the picture.
+        drop(screen);
+        self.step_fields(fields, &at);
+        self.losses.push(unread);
+        self.state.step += 1;
+        // What would be added after the last step would never be trained.
+        if self.state.step < self.config.steps {
+            let done = StepInfo {
+                step: self.state.step,
+                ..at
+            };
+            self.strategy(&done, &mut FieldGradients::new(), &[], Moment::After)?;
+        }
+        Ok(())
+    }
+
+    /// Renders a training view and measures its loss.
+    fn measure(
+        &mut self,
+        training_index: usize,
+        at: &StepInfo,
+        wants: ScreenWants,
+    ) -> Result<Measured, TrainError> {
+        let index = self.capture.split.train[training_index];
+        let factor = self.state.strategy.photo_factor(at);
+        let factor = factor.unwrap_or_else(|| coarse::factor(&self.config, at));
+        let view = self.coarse.view(&self.capture, index, factor.max(1));
+        let model = self.state.model.model();
+        let hooks = &self.state.hooks;
+        let hook_view = HookView {
+            training_index: Some(training_index),
+            name: &view.name,
+            purpose: Purpose::Training,
+        };
+        let camera = view.camera().relative_to(model.origin());
+        let cameras = CameraTensors::from_camera(&camera, &self.device);
+        let cameras = hooks.cameras(&hook_view, cameras)?;
+        let settings = self.render_settings(at.step);
+
+        let render = trace_span!("render").entered();
+        let mut projected = project_gaussians(model, &cameras, &settings)?;
+        let mut probe = None;
+        if wants.gradients {
+            let (probed, leaf) = projected.with_screen_probe();
+            (projected, probe) = (probed, Some(leaf));
+        }
+        let background = hooks.background(&hook_view, &cameras)?;
+        let rendered = render_projected_on(model, &projected, &cameras, background, &settings)?;
+        let rendered = hooks.image(&hook_view, rendered)?;
+        drop(render);
+        let levels = trace_span!("photo").in_scope(|| levels(&view, &self.device));
+        let target = TargetView::new(&view.name, levels, &cameras, at.step);
+        let evaluated = trace_span!("loss").in_scope(|| self.loss.evaluate(&target, &rendered))?;
+        let Some((mut loss, mut terms)) = evaluated else {
+            return Err(TrainError::Loss("has no term"));
+        };
+        let names = self.state.strategy.loss_term_names();
+        if !names.is_empty() {
+            let pass = Pass {
+                at: *at,
+                model,
+                projected: &projected,
+                rendered: &rendered,
+            };
+            let added = self.state.strategy.loss_terms(&pass)?;
+            if added.len() != names.len() {
+                return Err(TrainError::Setup(format!(
+                    "the strategy {} names {} loss terms and gives {}",
+                    self.state.strategy.name(),
+                    names.len(),
+                    added.len()
+                )));
+            }
+            for term in added {
+                terms.push(term.clone().inner());
+                loss = loss + term;
+            }
+        }
+        if !loss.is_tracked() {
+            return Err(TrainError::Loss("does not depend on the rendered image"));
+        }
+        Ok(Measured {
+            view: index,
+            loss,
+            terms,
+            projected,
+            probe,
+        })
+    }
+
+    /// The mean loss of the views of a step, its values to be logged, and what is on the screens.
+    #[expect(clippy::type_complexity, reason = "taken apart at once")]
+    fn together(
+        &self,
+        measured: Vec<Measured>,
+        at: &StepInfo,
+    ) -> Result<(Tensor<1>, UnreadLoss, Vec<(Projected, Option<Tensor<3>>)>), TrainError> {
+        let count = measured.len();
+        let share = 1.0 / count as f64;
+        let mut screen = Vec::with_capacity(count);
+        let mut sums: Option<(usize, Tensor<1>, Vec<Tensor<1>>)> = None;
+        for one in measured {
+            screen.push((one.projected, one.probe));
+            sums = Some(match sums {
+                None => (one.view, one.loss, one.terms),
+                Some((view, loss, terms)) => {
+                    let terms = terms.into_iter().zip(one.terms).map(|(a, b)| a + b);
+                    (view, loss + one.loss, terms.collect())
+                }
+            });
+        }
+        let Some((view, mut loss, mut terms)) = sums else {
+            return Err(TrainError::Config(
+                "`views_per_step` must be at least 1".into(),
+            ));
+        };
+        if count > 1 {
+            loss = loss * share;
+            terms = terms.into_iter().map(|term| term * share).collect();
+        }
+        let mut values = vec![loss.clone().inner()];
+        values.extend(terms);
+        let unread = UnreadLoss {
+            step: at.step + 1,
+            view,
+            values,
+        };
+        Ok((loss, unread, screen))
+    }
+
+    /// Lets the strategy look, before or after the optimisers' step.
+    fn strategy(
+        &mut self,
+        at: &StepInfo,
+        gradients: &mut FieldGradients,
+        screen: &[ScreenView],
+        moment: Moment,
+    ) -> Result<(), OpError> {
+        let origin = self.state.model.model().origin();
+        let device = self.device.clone();
+        let views = CaptureViews {
+            capture: &self.capture,
+            origin,
+            device: &device,
+        };
+        let mut context = StepContext {
+            at: *at,
+            model: &mut self.state.model,
+            gradients,
+            screen,
+            settings: self
+                .config
+                .render_settings(SH_DEGREE_MAX, self.schedule.scene_scale),
+            views: &views,
+        };
+        match moment {
+            Moment::Before => self.state.strategy.before_step(&mut context),
+            Moment::After => {
+                let _density = trace_span!("density").entered();
+                if self.state.strategy.after_step(&mut context)?.is_some() {
+                    let count = self.state.model.model().count();
+                    self.state.history.counts.push((at.step, count));
+                }
+                Ok(())
+            }
+        }
+    }
+
+    fn step_fields(&mut self, gradients: FieldGradients, at: &StepInfo) {
+        let _optimizer = trace_span!("optimizer").entered();
+        let strategy = &self.state.strategy;
+        self.state.model.step(gradients, |field| {
+            let rate = field.rate_at(at.step, at.run.steps, at.run.scene_scale);
+            (rate, strategy.field_step(at, field))
+        });
+    }
+
+    fn render_settings(&self, step: usize) -> RenderSettings {
+        let every = self.schedule.milestone(self.config.sh_degree_every);
+        let degree = (step / every).min(SH_DEGREE_MAX);
+        self.config
+            .render_settings(degree, self.schedule.scene_scale)
+    }
+
+    /// Reads all pending losses in one transfer.
+    pub(super) fn read_losses(&mut self) -> Result<(), TrainError> {
+        for read in self.losses.read(self.state.history.terms.len())? {
+            match read {
+                ReadLoss::Finite(record) => self.state.history.losses.push(record),
+                ReadLoss::NotFinite(step, view, value) => {
+                    let view = self.capture.views[view].name.clone();
+                    let last = self.state.history.losses.last();
+                    check_finite(step, &view, value, last, self.config.steps)?;
+                    self.warn(Warning::LossNotFinite { view, step });
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+/// When the strategy looks.
+enum Moment {
+    Before,
+    After,
+}

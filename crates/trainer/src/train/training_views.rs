@@ -1,0 +1,36 @@
+//! The training views as strategies see them.
+
+use burn::tensor::{Device, Tensor};
+use splat_data::Capture;
+use splat_model::CameraTensors;
+use splat_model::strategy::TrainingViews;
+
+use crate::photo::photo;
+
+/// The views of a capture that are trained on, in the capture's own resolution.
+pub(super) struct CaptureViews<'a> {
+    pub(super) capture: &'a Capture,
+    pub(super) origin: [f64; 3],
+    pub(super) device: &'a Device,
+}
+
+impl CaptureViews<'_> {
+    fn view(&self, view: usize) -> &splat_data::View {
+        &self.capture.views[self.capture.split.train[view]]
+    }
+}
+
+impl TrainingViews for CaptureViews<'_> {
+    fn count(&self) -> usize {
+        self.capture.split.train.len()
+    }
+
+    fn camera(&self, view: usize) -> CameraTensors {
+        let camera = self.view(view).camera().relative_to(self.origin);
+        CameraTensors::from_camera(&camera, self.device)
+    }
+
+    fn photo(&self, view: usize) -> Tensor<4> {
+        photo(self.view(view), self.device)
+    }
+}
