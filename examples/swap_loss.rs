@@ -18,17 +18,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args().skip(1);
     let folder = arguments.next().unwrap_or("examples/data/saharov".into());
     let steps = arguments.next().map_or(Ok(300), |steps| steps.parse())?;
-    let capture = Capture::load(
-        folder,
-        &CaptureOptions {
-            downscale: 2,
-            ..CaptureOptions::default()
-        },
-    )?;
-    let config = TrainConfig {
-        steps,
-        ..TrainConfig::default()
-    };
+    let capture = Capture::load(folder, &CaptureOptions::new().with_downscale(2))?;
+    let config = TrainConfig::new().with_steps(steps);
     let loss = LossTerms::new()
         .term("charbonnier", 0.8, |view, rendered| {
             Ok(charbonnier(rendered.image() - view.image()))

@@ -25,6 +25,8 @@ pub use splat_data as data;
 pub use splat_lab as lab;
 pub use splat_model as model;
 pub use splat_ops as ops;
+#[cfg(any(feature = "wgpu", feature = "cuda"))]
+pub use splat_ops::cubecl;
 pub use splat_trainer as train;
 
 pub mod prelude;

@@ -99,9 +99,10 @@ fn infinities_train() {
                 let rendered = render(model.model(), &cameras, &RenderSettings::default()).unwrap();
                 let loss = (rendered.image() - target.clone()).abs().mean();
                 let gradients = model.gradients(&mut loss.backward());
-                model.step(gradients, |field| {
+                let stepped = model.step(gradients, |field| {
                     (field.rate_at(step, 20, unit), FieldStep::Step(1.0))
                 });
+                stepped.unwrap();
                 loss.into_scalar::<f32>()
             })
             .collect();

@@ -1,6 +1,7 @@
 //! Initial Gaussians from SfM points (3DGS section 5.1).
 
 use core::num::NonZero;
+use derive_setters::Setters;
 use std::collections::HashMap;
 
 use kiddo::{ImmutableKdTree, SquaredEuclidean};
@@ -14,8 +15,9 @@ use splat_data::SplatData;
 const DARKEST_LEVEL: f64 = 0.5;
 
 /// How the first Gaussians are made.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Setters)]
 #[serde(default, deny_unknown_fields)]
+#[setters(prefix = "with_", strip_option)]
 pub struct InitSettings {
     /// Opacity of every Gaussian, between 1/255, below which nothing is drawn, and 1. Default 0.1.
     pub opacity: f64,
@@ -23,6 +25,13 @@ pub struct InitSettings {
     pub scale: f64,
     /// Highest degree of spherical harmonics to make room for. Default 3.
     pub sh_degree: usize,
+}
+
+impl InitSettings {
+    /// The defaults; `with_*` methods change them one by one.
+    pub fn new() -> Self {
+        Self::default()
+    }
 }
 
 impl Default for InitSettings {

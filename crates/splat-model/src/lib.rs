@@ -8,8 +8,6 @@ pub mod losses;
 mod model;
 mod morton;
 mod optimized;
-#[cfg(all(test, feature = "cpu"))]
-mod optimized_tests;
 pub mod optimizer;
 mod rates;
 mod record;

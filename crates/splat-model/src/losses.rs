@@ -1,6 +1,7 @@
 //! Image losses and metrics, as functions on tensors of images `[B, H, W, D]`.
 
 use burn::tensor::Tensor;
+use derive_setters::Setters;
 use splat_ops::{OpError, SsimArgs, photometric};
 
 /// Mean absolute difference, `[1]`.
@@ -20,7 +21,8 @@ pub fn psnr(image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
 }
 
 /// Settings of structural similarity; the defaults are those of Wang et al. 2004 for images in [0, 1].
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Setters)]
+#[setters(prefix = "with_")]
 pub struct SsimSettings {
     /// Side of the Gaussian window in pixels, odd. Default 11.
     pub window: usize,
@@ -44,6 +46,11 @@ impl Default for SsimSettings {
 }
 
 impl SsimSettings {
+    /// The defaults; `with_*` methods change them one by one.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
     /// The window's weights along one axis; they sum to one.
     pub fn weights(&self) -> Vec<f64> {
         let radius = (self.window / 2) as f64;

@@ -1,10 +1,12 @@
 //! Learning rates of the Gaussians (3DGS section 7.1; values of gsplat's default column).
 
+use derive_setters::Setters;
 use serde::{Deserialize, Serialize};
 
 /// Learning rates per field.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Setters)]
 #[serde(default, deny_unknown_fields)]
+#[setters(prefix = "with_", strip_option)]
 pub struct LearningRates {
     /// Of the means at the first step, in units of the scene's scale.
     pub means: f64,
@@ -20,6 +22,13 @@ pub struct LearningRates {
     pub sh0: f64,
     /// Of the higher spherical harmonics.
     pub sh_rest: f64,
+}
+
+impl LearningRates {
+    /// The defaults; `with_*` methods change them one by one.
+    pub fn new() -> Self {
+        Self::default()
+    }
 }
 
 impl Default for LearningRates {

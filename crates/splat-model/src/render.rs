@@ -1,18 +1,20 @@
 //! The three ops composed: Gaussians and a camera to an image.
 
 use burn::tensor::Tensor;
+use derive_setters::Setters;
 use splat_data::SplatData;
 use splat_ops::{
-    ClampGradient, OpError, ProjectSettings, Projected, RasterizeSettings, Rendered, project,
-    rasterize,
+    ClampGradient, OpError, ProjectSettings, Projected, RasterizeSettings, Rendered, SH_DEGREE_MAX,
+    project, rasterize,
 };
 
 use crate::{CameraTensors, SplatModel};
 
 /// How to render.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Setters)]
+#[setters(prefix = "with_", strip_option)]
 pub struct RenderSettings {
-    /// Highest degree of spherical harmonics to evaluate; at most what the model has.
+    /// Highest degree of spherical harmonics to evaluate; at most what the model has. Default 3: all of them.
     pub sh_degree: usize,
     /// Gradient of the clamp of colours at zero; [`ClampGradient::Recovering`] for training. Default exact.
     pub clamp_gradient: ClampGradient,
@@ -24,6 +26,26 @@ pub struct RenderSettings {
     pub project: ProjectSettings,
     /// Settings of the rasteriser.
     pub rasterize: RasterizeSettings,
+}
+
+impl Default for RenderSettings {
+    fn default() -> Self {
+        Self {
+            sh_degree: SH_DEGREE_MAX,
+            clamp_gradient: ClampGradient::default(),
+            antialias: false,
+            background: None,
+            project: ProjectSettings::default(),
+            rasterize: RasterizeSettings::default(),
+        }
+    }
+}
+
+impl RenderSettings {
+    /// The defaults; `with_*` methods change them one by one.
+    pub fn new() -> Self {
+        Self::default()
+    }
 }
 
 impl RenderSettings {

@@ -49,6 +49,8 @@ pub use adam::{AdamRows, AdamStep, adam_step};
 pub use blur::gaussian_blur;
 #[cfg(feature = "cpu")]
 pub use cpu::RasterizeWork;
+#[cfg(feature = "cube")]
+pub use cubecl;
 #[cfg(feature = "cpu")]
 pub use device::rasterize_work;
 pub use error::{ErrorSlot, OpError};

@@ -47,8 +47,8 @@ impl Hook for Exposure {
 
     fn step(&mut self, gradients: &mut Gradients, _: &StepInfo) -> Result<(), OpError> {
         let gradients = self.0.gradients(gradients);
-        self.0.step(gradients, |field| (field.rate, FieldStep::Step(1.0)));
-        Ok(())
+        self.0
+            .step(gradients, |field| (field.rate, FieldStep::Step(1.0)))
     }
 
     fn save(&self) -> Result<StateRecord, OpError> {

@@ -16,16 +16,9 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args().skip(1);
     let folder = arguments.next().unwrap_or("../data/saharov".into());
     let steps = arguments.next().map_or(Ok(200), |steps| steps.parse())?;
-    let options = CaptureOptions {
-        downscale: 4,
-        ..CaptureOptions::default()
-    };
-    let capture = Capture::load(folder, &options)?;
+    let capture = Capture::load(folder, &CaptureOptions::new().with_downscale(4))?;
     let device = Device::flex();
-    let config = TrainConfig {
-        steps,
-        ..TrainConfig::default()
-    };
+    let config = TrainConfig::new().with_steps(steps);
     // A loss is a closure on tensors, or a list of named and weighted ones.
     let loss = LossTerms::l1_ssim(0.2).term("opaque", 0.01, |_, rendered| {
         Ok((1.0 - rendered.alpha()).mean())

@@ -21,6 +21,7 @@ mod save;
 mod sparse_model;
 mod split;
 
+use derive_setters::Setters;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -79,13 +80,21 @@ pub struct Point {
 }
 
 /// How to read a capture.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Setters)]
+#[setters(prefix = "with_", strip_option)]
 pub struct CaptureOptions {
     /// Area-average every photo by this factor, at least 1 (1: as it is). Default 1.
     pub downscale: u32,
     /// Folder of the photos, relative to the capture's or absolute. Default: `images`, or the capture's own folder where
     /// there is no `images`.
     pub images: Option<PathBuf>,
+}
+
+impl CaptureOptions {
+    /// The defaults; `with_*` methods change them one by one.
+    pub fn new() -> Self {
+        Self::default()
+    }
 }
 
 impl Default for CaptureOptions {

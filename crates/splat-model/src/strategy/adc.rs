@@ -1,6 +1,7 @@
 //! Adaptive density control of 3DGS (section 5.2), with the defaults of gsplat.
 
 use burn::tensor::{Device, Tensor, TensorData};
+use derive_setters::Setters;
 use glam::{Quat, Vec3};
 use rand::SeedableRng;
 use rand_distr::{Distribution, StandardNormal};
@@ -18,8 +19,9 @@ use crate::{Optimized, SplatModel};
 /// Settings of adaptive density control. Milestones are stated for a run of 30,000 steps and shrink
 /// with shorter runs. Intervals do not: statistics need their hundred views, and opacities their
 /// hundreds of steps to recover from a reset, however short the run.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Setters)]
 #[serde(default, deny_unknown_fields)]
+#[setters(prefix = "with_", strip_option)]
 pub struct AdcSettings {
     /// Rows may be added after this step, or after a quarter of the run where that is sooner: before,
     /// gradients are those of a scene that has not formed yet. Default 500.
@@ -48,6 +50,13 @@ pub struct AdcSettings {
     /// No growth beyond this many Gaussians. Default: none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub max_gaussians: Option<usize>,
+}
+
+impl AdcSettings {
+    /// The defaults; `with_*` methods change them one by one.
+    pub fn new() -> Self {
+        Self::default()
+    }
 }
 
 impl Default for AdcSettings {
@@ -259,7 +268,7 @@ impl<M: SplatModel> Strategy<M> for Adc {
             report = Some(refinement);
         }
         if resets {
-            context.model.clamp_opacities(reset_opacity);
+            context.model.clamp_opacities(reset_opacity)?;
             report.get_or_insert_default().reset = true;
         }
         Ok(report)

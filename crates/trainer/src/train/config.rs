@@ -1,5 +1,6 @@
 //! Everything that determines a training run, apart from the capture and the loss.
 
+use derive_setters::Setters;
 use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
@@ -18,8 +19,9 @@ const MOST_HALVINGS: u32 = 8;
 pub(super) const MOST_STEPS: u64 = 1_000_000_000_000;
 
 /// Settings of a training run; together with the capture and the seed they repeat it.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Setters)]
 #[serde(default, deny_unknown_fields)]
+#[setters(prefix = "with_", strip_option)]
 pub struct TrainConfig {
     /// Number of steps; milestones stated for 30,000 steps shrink with shorter runs. Default 30,000.
     pub steps: usize,
@@ -57,6 +59,13 @@ pub struct TrainConfig {
     /// photo, or one for every hundred of all photos that are trained on (300 values for up to 59 parameters), whichever is
     /// more; docs/TRAINING.md has what more would give.
     pub density: AdcSettings,
+}
+
+impl TrainConfig {
+    /// The defaults; `with_*` methods change them one by one.
+    pub fn new() -> Self {
+        Self::default()
+    }
 }
 
 impl Default for TrainConfig {

@@ -115,7 +115,7 @@ impl<M: SplatModel> Trainer<M> {
         self.strategy(&at, &mut fields, &screen, Moment::Before)?;
         // The optimisers need nothing of the picture.
         drop(screen);
-        self.step_fields(fields, &at);
+        self.step_fields(fields, &at)?;
         self.losses.push(unread);
         self.state.step += 1;
         // What would be added after the last step would never be trained.
@@ -281,13 +281,13 @@ impl<M: SplatModel> Trainer<M> {
         }
     }
 
-    fn step_fields(&mut self, gradients: FieldGradients, at: &StepInfo) {
+    fn step_fields(&mut self, gradients: FieldGradients, at: &StepInfo) -> Result<(), OpError> {
         let _optimizer = trace_span!("optimizer").entered();
         let strategy = &self.state.strategy;
         self.state.model.step(gradients, |field| {
             let rate = field.rate_at(at.step, at.run.steps, at.run.scene_scale);
             (rate, strategy.field_step(at, field))
-        });
+        })
     }
 
     fn render_settings(&self, step: usize) -> RenderSettings {

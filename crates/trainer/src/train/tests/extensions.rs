@@ -219,8 +219,7 @@ impl Hook for Exposure {
         let gradients = self.0.gradients(gradients);
         assert_eq!(gradients.len(), 1);
         self.0
-            .step(gradients, |field| (field.rate, FieldStep::Step(1.0)));
-        Ok(())
+            .step(gradients, |field| (field.rate, FieldStep::Step(1.0)))
     }
 
     fn save(&self) -> Result<StateRecord, OpError> {

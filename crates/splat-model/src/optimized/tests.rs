@@ -64,7 +64,7 @@ fn step(model: &mut Optimized<Model>, how: FieldStep) {
         + inner.fixed.val().sum();
     let gradients = model.gradients(&mut loss.backward());
     assert_eq!(gradients.len(), 4, "what is no field has none");
-    model.step(gradients, |field| (field.rate, how));
+    model.step(gradients, |field| (field.rate, how)).unwrap();
 }
 
 #[test]
@@ -227,4 +227,26 @@ fn all_of_a_module_rides_along() {
         .collect();
     assert_eq!(names, ["means", "heat"]);
     assert!(module.fields().iter().all(|field| field.row_set.is_none()));
+}
+
+#[test]
+fn values_and_gradients_of_another_shape_are_refused() {
+    let device = Device::flex().autodiff();
+    let mut optimized = optimized(&device);
+    let inner = device.clone().without_autodiff();
+    let wrong = Tensor::<2>::ones([3, 3], &inner);
+    let gradients = [("means".to_owned(), wrong.clone())].into();
+    let message = optimized.step(gradients, |field| (field.rate, FieldStep::Step(1.0)));
+    assert!(
+        message
+            .unwrap_err()
+            .to_string()
+            .contains("`means` has shape [3, 3]")
+    );
+    let message = optimized.update("gain", |_| wrong.clone()).unwrap_err();
+    assert!(message.to_string().contains("`gain` has shape [3, 3]"));
+    let message = optimized.update("cold", |value| value).unwrap_err();
+    assert!(message.to_string().contains("no field `cold`"));
+    optimized.update("gain", |value| value * 2.0).unwrap();
+    assert_eq!(values(&optimized.model().gain), [0.0, 2.0, 4.0, 6.0]);
 }

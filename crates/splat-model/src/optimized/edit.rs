@@ -1,0 +1,142 @@
+//! Edits of rows, of the values and the moments alike.
+
+use burn::module::Module;
+use burn::tensor::{Int, Tensor, TensorData};
+use splat_ops::OpError;
+
+use super::Optimized;
+use super::fields::change;
+use crate::field::Field;
+use crate::optimizer::MomentEdit;
+use crate::rows::{FieldChanges, Moments, RowEdit};
+
+impl<M: Module> Optimized<M> {
+    /// Edits the rows of every field of a row set, and the moments with them: a gather per field on the device.
+    /// Parameters keep their ids.
+    ///
+    /// # Errors
+    /// When the edit names an old row or a field that there is not, or values of another width.
+    pub fn edit_rows(&mut self, edit: &RowEdit) -> Result<(), OpError> {
+        self.check_edit(edit)?;
+        let device = match self
+            .fields
+            .iter()
+            .find(|field| field.row_set == Some(edit.row_set()))
+        {
+            Some(field) => match self.field(&field.name) {
+                Some(value) => value.device(),
+                None => return Ok(()),
+            },
+            None => return Ok(()),
+        };
+        let n = edit.len();
+        let sources: Vec<i32> = edit.sources().iter().map(|row| *row as i32).collect();
+        let keep: Vec<f32> = edit
+            .moments()
+            .iter()
+            .map(|moments| f32::from(u8::from(*moments == Moments::Keep)))
+            .collect();
+        let source = Tensor::<1, Int>::from_data(TensorData::new(sources, [n]), &device);
+        let keep = Tensor::<1>::from_data(TensorData::new(keep, [n]), &device);
+        let mut changes = edit.changes();
+        let edited: Vec<String> = self
+            .fields
+            .iter()
+            .filter(|field| field.row_set == Some(edit.row_set()))
+            .map(|field| field.name.clone())
+            .collect();
+        let names = self.names();
+        change(&mut self.model, names, |name, value| {
+            if !edited.iter().any(|field| field == name) {
+                return value;
+            }
+            let value = value.select(0, source.clone());
+            match changes.remove(name) {
+                Some(changes) => changed(value, changes),
+                None => value,
+            }
+        });
+        let moments = MomentEdit::Gather { source, keep };
+        for field in &edited {
+            if let Some(optimizer) = self.optimizers.get_mut(field) {
+                optimizer.edit_rows(&moments);
+            }
+            if let Some(waiting) = self.waiting.remove(field) {
+                self.waiting.insert(field.clone(), moments.apply(waiting));
+            }
+        }
+        Ok(())
+    }
+
+    /// Every row and width of an edit, before anything is changed.
+    fn check_edit(&self, edit: &RowEdit) -> Result<(), OpError> {
+        let wrong = |what: String| {
+            Err(OpError::Argument {
+                op: "Optimized::edit_rows",
+                what,
+            })
+        };
+        let shapes = self.shapes();
+        let in_set = |field: &&Field| field.row_set == Some(edit.row_set());
+        for field in self.fields.iter().filter(in_set) {
+            let [rows, _] = shapes[&field.name];
+            let beyond = |source: &u32| *source as usize >= rows;
+            if let Some(index) = edit.sources().iter().position(beyond) {
+                return wrong(format!(
+                    "new row {index} is made from row {} of `{}`, which has {rows}",
+                    edit.sources()[index],
+                    field.name
+                ));
+            }
+        }
+        for (name, changes) in edit.changes() {
+            let known = self
+                .fields
+                .iter()
+                .filter(in_set)
+                .any(|field| field.name == name);
+            if !known {
+                return wrong(format!(
+                    "it changes `{name}`, which is no field of the row set"
+                ));
+            }
+            let [_, width] = shapes[name];
+            let fits = changes
+                .offsets
+                .as_ref()
+                .is_none_or(|all| all.len() == width * edit.len())
+                && changes.set_values.len() == width * changes.set_rows.len();
+            if !fits {
+                return wrong(format!("values for `{name}` must be {width} a row"));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Gathered rows with what the edit adds to them and puts in their place.
+fn changed(value: Tensor<2>, changes: FieldChanges) -> Tensor<2> {
+    let device = value.device();
+    let [n, width] = value.dims();
+    let value = match changes.offsets {
+        Some(offsets) => value + Tensor::from_data(TensorData::new(offsets, [n, width]), &device),
+        None => value,
+    };
+    if changes.set_rows.is_empty() {
+        return value;
+    }
+    let mut set = vec![0.0; n * width];
+    let mut is_set = vec![false; n * width];
+    for (row, values) in changes
+        .set_rows
+        .iter()
+        .zip(changes.set_values.chunks(width.max(1)))
+    {
+        let row = row * width..(row + 1) * width;
+        set[row.clone()].copy_from_slice(values);
+        is_set[row].fill(true);
+    }
+    let set = Tensor::from_data(TensorData::new(set, [n, width]), &device);
+    let mask = Tensor::from_data(TensorData::new(is_set, [n, width]), &device);
+    value.mask_where(mask, set)
+}

@@ -1,0 +1,148 @@
+//! The parameters that fields name: visited and changed as `[N, width]`, whatever their rank.
+
+use std::collections::HashMap;
+
+use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
+use burn::tensor::{Gradients, Tensor};
+
+use super::FieldGradients;
+
+/// `[N, ...]` as `[N, width]`.
+pub(super) fn flat<const D: usize>(value: Tensor<D>) -> Tensor<2> {
+    let dims = value.dims();
+    let width: usize = dims[1..].iter().product();
+    // Burn's reshape reads a zero as "keep this dimension".
+    value.reshape([dims[0], width])
+}
+
+/// Paths of all float parameters.
+#[derive(Default)]
+pub(super) struct Paths {
+    pub(super) path: Vec<String>,
+    pub(super) found: Vec<String>,
+}
+
+impl ModuleVisitor for Paths {
+    fn enter_module(&mut self, name: &str, _: &str) {
+        self.path.push(name.to_owned());
+    }
+
+    fn exit_module(&mut self, _: &str, _: &str) {
+        self.path.pop();
+    }
+
+    fn visit_float<const D: usize>(&mut self, _: &Param<Tensor<D>>) {
+        self.found.push(self.path.join("."));
+    }
+}
+
+/// What is done with a parameter of a field.
+pub(super) trait VisitField {
+    fn visit<const D: usize>(&mut self, name: &str, param: &Param<Tensor<D>>);
+}
+
+pub(super) struct FieldVisitor<V> {
+    /// Names of fields by path.
+    pub(super) names: HashMap<String, String>,
+    pub(super) path: Vec<String>,
+    pub(super) visit: V,
+}
+
+impl<V: VisitField> ModuleVisitor for FieldVisitor<V> {
+    fn enter_module(&mut self, name: &str, _: &str) {
+        self.path.push(name.to_owned());
+    }
+
+    fn exit_module(&mut self, _: &str, _: &str) {
+        self.path.pop();
+    }
+
+    fn visit_float<const D: usize>(&mut self, param: &Param<Tensor<D>>) {
+        if let Some(name) = self.names.get(&self.path.join(".")) {
+            self.visit.visit(name, param);
+        }
+    }
+}
+
+pub(super) struct ValuesOf<F>(pub(super) F);
+
+impl<F: FnMut(&str, Tensor<2>)> VisitField for ValuesOf<F> {
+    fn visit<const D: usize>(&mut self, name: &str, param: &Param<Tensor<D>>) {
+        let value = param.val();
+        let value = if value.device().is_autodiff() {
+            value.inner()
+        } else {
+            value
+        };
+        (self.0)(name, flat(value));
+    }
+}
+
+pub(super) struct GradientsOf<'a> {
+    pub(super) gradients: &'a mut Gradients,
+    pub(super) taken: &'a mut FieldGradients,
+}
+
+impl VisitField for GradientsOf<'_> {
+    fn visit<const D: usize>(&mut self, name: &str, param: &Param<Tensor<D>>) {
+        if param.is_require_grad()
+            && let Some(gradient) = param.val().grad_remove(self.gradients)
+        {
+            self.taken.insert(name.to_owned(), flat(gradient));
+        }
+    }
+}
+
+/// Maps the values of fields outside of the autodiff graph. While one is changed nothing else holds it, so that an
+/// optimiser can write into its memory.
+pub(super) fn change<M: Module>(
+    model: &mut Option<M>,
+    names: HashMap<String, String>,
+    map: impl FnMut(&str, Tensor<2>) -> Tensor<2>,
+) {
+    let mut mapper = FieldMapper {
+        names,
+        path: Vec::new(),
+        map,
+    };
+    *model = model.take().map(|whole| whole.map(&mut mapper));
+}
+
+struct FieldMapper<F> {
+    names: HashMap<String, String>,
+    path: Vec<String>,
+    map: F,
+}
+
+impl<F: FnMut(&str, Tensor<2>) -> Tensor<2>> ModuleMapper for FieldMapper<F> {
+    fn enter_module(&mut self, name: &str, _: &str) {
+        self.path.push(name.to_owned());
+    }
+
+    fn exit_module(&mut self, _: &str, _: &str) {
+        self.path.pop();
+    }
+
+    fn map_float<const D: usize>(&mut self, param: Param<Tensor<D>>) -> Param<Tensor<D>> {
+        let Some(name) = self.names.get(&self.path.join(".")) else {
+            return param;
+        };
+        param.map(|value| {
+            let (requires_grad, tracked) = (value.is_require_grad(), value.device().is_autodiff());
+            let strategy = value.gradient_checkpointing_strategy();
+            let mut dims = value.dims();
+            let value = if tracked { value.inner() } else { value };
+            let value = (self.map)(name, flat(value));
+            dims[0] = value.dims()[0];
+            let value = value.reshape(dims);
+            if !tracked {
+                return value;
+            }
+            let mut value = Tensor::from_inner(value);
+            if let Some(strategy) = strategy {
+                value = value.with_gradient_checkpointing_strategy(strategy);
+            }
+            value.set_require_grad(requires_grad)
+        })
+    }
+}

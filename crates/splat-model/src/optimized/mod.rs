@@ -1,0 +1,355 @@
+//! A model and the optimisers of its fields, stepped and edited together.
+
+mod edit;
+mod fields;
+mod save;
+#[cfg(all(test, feature = "cpu"))]
+mod tests;
+
+use std::collections::{BTreeMap, HashMap};
+
+use burn::module::Module;
+use burn::tensor::{Gradients, Tensor, Transaction};
+use splat_data::SceneScale;
+use splat_ops::{AdamRows, OpError};
+
+use crate::field::Field;
+use crate::optimizer::{FieldOptimizer, MomentEdit, SplatAdam};
+use crate::{LearningRates, SplatModel};
+use fields::{FieldVisitor, GradientsOf, Paths, ValuesOf, change};
+
+/// Gradients by the name of the field, each `[N, width]`: what is beyond the first dimension is flattened.
+pub type FieldGradients = BTreeMap<String, Tensor<2>>;
+
+/// What the optimiser does with a field in a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum FieldStep {
+    /// A step, with the field's rate times this factor.
+    Step(f64),
+    /// None; the gradient is added to that of the next step.
+    Accumulate,
+    /// None; the gradient is forgotten.
+    Skip,
+}
+
+/// A model, and for each of its fields an optimiser that owns the field's moments.
+///
+/// Rows of the model are edited here only, so that moments always belong to the rows beside them.
+#[derive(Debug)]
+pub struct Optimized<M> {
+    /// Taken out while it is changed.
+    model: Option<M>,
+    fields: Vec<Field>,
+    optimizers: BTreeMap<String, FieldOptimizer>,
+    /// Gradients that wait for a step.
+    waiting: FieldGradients,
+}
+
+impl<M: Module> Optimized<M> {
+    /// A model, with an optimiser for each of its fields.
+    ///
+    /// # Errors
+    /// When the model has no parameter of a field's path, or two fields share a name.
+    pub fn new(
+        model: M,
+        fields: Vec<Field>,
+        optimizer: impl Fn(&Field) -> FieldOptimizer,
+    ) -> Result<Self, OpError> {
+        let optimizers = (fields.iter())
+            .map(|field| (field.name.clone(), optimizer(field)))
+            .collect::<BTreeMap<_, _>>();
+        let trained = Self {
+            model: Some(model),
+            fields,
+            optimizers,
+            waiting: FieldGradients::new(),
+        };
+        trained.check_fields()?;
+        Ok(trained)
+    }
+
+    /// A model with [`SplatAdam`] for each of its fields, stepping `rows`.
+    ///
+    /// # Errors
+    /// As those of [`new`](Self::new).
+    pub fn with_adam(
+        model: M,
+        rates: &LearningRates,
+        rows: AdamRows,
+        scene: SceneScale,
+    ) -> Result<Self, OpError>
+    where
+        M: SplatModel,
+    {
+        let fields = model.fields(rates);
+        Self::new(model, fields, |field| {
+            SplatAdam::of_field(field, rows, scene).into()
+        })
+    }
+
+    /// A module whose float parameters are all trained with one learning rate, and have no row per Gaussian: what rides
+    /// along with a model.
+    ///
+    /// # Errors
+    /// As those of [`new`](Self::new).
+    pub fn of_module(
+        module: M,
+        rate: f64,
+        optimizer: impl Fn(&Field) -> FieldOptimizer,
+    ) -> Result<Self, OpError> {
+        let mut paths = Paths::default();
+        module.visit(&mut paths);
+        let field = |path: String| Field {
+            name: path.replace('.', "/"),
+            path,
+            ..Field::shared("", rate)
+        };
+        Self::new(
+            module,
+            paths.found.into_iter().map(field).collect(),
+            optimizer,
+        )
+    }
+
+    fn check_fields(&self) -> Result<(), OpError> {
+        let wrong = |what: String| {
+            Err(OpError::Argument {
+                op: "SplatModel::fields",
+                what,
+            })
+        };
+        if self.optimizers.len() != self.fields.len() {
+            return wrong("two fields have one name; give each its own".to_owned());
+        }
+        if let Some(field) = self.fields.iter().find(|field| field.name.contains('.')) {
+            return wrong(format!(
+                "the name `{}` has a dot, which separates names in checkpoints",
+                field.name
+            ));
+        }
+        let shapes = self.shapes();
+        let mut sets: BTreeMap<usize, (&str, usize)> = BTreeMap::new();
+        for field in &self.fields {
+            match shapes.get(&field.name).map(|[rows, _]| rows) {
+                None => {
+                    return wrong(format!(
+                        "the model has no float parameter `{}`, which field `{}` names",
+                        field.path, field.name
+                    ));
+                }
+                Some(count) => {
+                    let Some(set) = field.row_set else { continue };
+                    let (first, expected) = sets.entry(set).or_insert((&field.name, *count));
+                    if expected != count {
+                        return wrong(format!(
+                            "`{}` has {count} rows, `{first}` of the same row set {expected}; declare it in another set or as shared",
+                            field.name
+                        ));
+                    }
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// The model.
+    pub fn model(&self) -> &M {
+        self.model.as_ref().expect(WHOLE)
+    }
+
+    /// The model without its moments.
+    pub fn into_model(self) -> M {
+        self.model.expect(WHOLE)
+    }
+
+    /// The fields that are trained.
+    pub fn fields(&self) -> &[Field] {
+        &self.fields
+    }
+
+    /// The value of a field, `[N, width]`, outside of the autodiff graph.
+    pub fn field(&self, name: &str) -> Option<Tensor<2>> {
+        let mut found = None;
+        self.visit(|field, value| {
+            if field == name {
+                found = Some(value);
+            }
+        });
+        found
+    }
+
+    /// The values of fields on the host, each `[N][width]` flattened, in one transfer.
+    ///
+    /// # Errors
+    /// When the model has no such field, or the device fails.
+    pub fn read<const K: usize>(&self, names: [&str; K]) -> Result<[Vec<f32>; K], OpError> {
+        let mut values = BTreeMap::new();
+        self.visit(|field, value| {
+            if names.contains(&field) {
+                values.insert(field.to_owned(), value);
+            }
+        });
+        let missing = |name: &str| OpError::Argument {
+            op: "Optimized::read",
+            what: format!("the model has no field `{name}`"),
+        };
+        let tensors: Vec<Tensor<2>> = names
+            .iter()
+            .map(|name| values.remove(*name).ok_or_else(|| missing(name)))
+            .collect::<Result<_, _>>()?;
+        let read = tensors
+            .into_iter()
+            .fold(Transaction::default(), Transaction::register);
+        let read = read.try_execute().map_err(|error| OpError::Device {
+            op: "Optimized::read",
+            what: error.to_string(),
+        })?;
+        let mut read = read.into_iter();
+        Ok(core::array::from_fn(|_| {
+            let data = read.next().map(|data| data.convert::<f32>());
+            data.and_then(|data| data.try_into_vec().ok())
+                .unwrap_or_default()
+        }))
+    }
+
+    /// Takes the gradients of the fields out of those of a backward pass.
+    pub fn gradients(&self, gradients: &mut Gradients) -> FieldGradients {
+        let mut taken = FieldGradients::new();
+        let mut visitor = FieldVisitor {
+            names: self.names(),
+            path: Vec::new(),
+            visit: GradientsOf {
+                gradients,
+                taken: &mut taken,
+            },
+        };
+        self.model().visit(&mut visitor);
+        taken
+    }
+
+    /// Steps every field that has a gradient, as `how` says: its rate, and what is to be done.
+    ///
+    /// # Errors
+    /// When a gradient has not the shape of its field; no field has taken a step then.
+    pub fn step(
+        &mut self,
+        mut gradients: FieldGradients,
+        how: impl Fn(&Field) -> (f64, FieldStep),
+    ) -> Result<(), OpError> {
+        self.check_shapes("Optimized::step", &gradients)?;
+        let mut steps = BTreeMap::new();
+        for field in &self.fields {
+            let Some(gradient) = gradients.remove(&field.name) else {
+                continue;
+            };
+            let gradient = match self.waiting.remove(&field.name) {
+                Some(waiting) => waiting + gradient,
+                None => gradient,
+            };
+            match how(field) {
+                (rate, FieldStep::Step(factor)) => {
+                    steps.insert(field.name.clone(), (rate * factor, gradient));
+                }
+                (_, FieldStep::Accumulate) => {
+                    self.waiting.insert(field.name.clone(), gradient);
+                }
+                (_, FieldStep::Skip) => {}
+            }
+        }
+        let names = self.names();
+        let optimizers = &mut self.optimizers;
+        change(&mut self.model, names, |name, value| {
+            match (steps.remove(name), optimizers.get_mut(name)) {
+                (Some((rate, gradient)), Some(optimizer)) => optimizer.step(rate, value, gradient),
+                _ => value,
+            }
+        });
+        Ok(())
+    }
+
+    fn check_shapes(&self, op: &'static str, tensors: &FieldGradients) -> Result<(), OpError> {
+        let shapes = self.shapes();
+        let wrong = tensors
+            .iter()
+            .find(|(name, tensor)| shapes.get(*name) != Some(&tensor.dims()));
+        match wrong {
+            None => Ok(()),
+            Some((name, tensor)) => Err(OpError::Argument {
+                op,
+                what: format!(
+                    "`{name}` has shape {:?}, the field of that name {:?}",
+                    tensor.dims(),
+                    shapes.get(name)
+                ),
+            }),
+        }
+    }
+
+    /// Replaces the value `[N, width]` of a field by another of its shape, and leaves its moments.
+    ///
+    /// # Errors
+    /// When the model has no such field, or the new value another shape; the field is then as it was.
+    pub fn update(
+        &mut self,
+        field: &str,
+        update: impl FnOnce(Tensor<2>) -> Tensor<2>,
+    ) -> Result<(), OpError> {
+        let value = self.field(field).ok_or_else(|| OpError::Argument {
+            op: "Optimized::update",
+            what: format!("the model has no field `{field}`"),
+        })?;
+        let updated = FieldGradients::from([(field.to_owned(), update(value))]);
+        self.check_shapes("Optimized::update", &updated)?;
+        let (names, mut updated) = (self.names(), updated);
+        change(&mut self.model, names, |name, value| {
+            updated.remove(name).unwrap_or(value)
+        });
+        Ok(())
+    }
+
+    /// Lets all moments of a field start anew.
+    pub fn restart_moments(&mut self, field: &str) {
+        if let Some(optimizer) = self.optimizers.get_mut(field) {
+            optimizer.edit_rows(&MomentEdit::Restart);
+        }
+        self.waiting.remove(field);
+    }
+
+    /// Lowers every opacity to at most `opacity` and lets the moments of the logits start anew (the opacity reset of 3DGS
+    /// section 5.2).
+    ///
+    /// # Errors
+    /// When the model has no opacity logits.
+    pub fn clamp_opacities(&mut self, opacity: f64) -> Result<(), OpError> {
+        let logit = (opacity / (1.0 - opacity)).ln();
+        self.update("opacity_logits", |logits| logits.clamp_max(logit))?;
+        self.restart_moments("opacity_logits");
+        Ok(())
+    }
+
+    fn shapes(&self) -> BTreeMap<String, [usize; 2]> {
+        let mut shapes = BTreeMap::new();
+        self.visit(|name, value| {
+            shapes.insert(name.to_owned(), value.dims());
+        });
+        shapes
+    }
+
+    fn names(&self) -> HashMap<String, String> {
+        let names = self.fields.iter();
+        names
+            .map(|field| (field.path.clone(), field.name.clone()))
+            .collect()
+    }
+
+    fn visit(&self, visit: impl FnMut(&str, Tensor<2>)) {
+        let mut visitor = FieldVisitor {
+            names: self.names(),
+            path: Vec::new(),
+            visit: ValuesOf(visit),
+        };
+        self.model().visit(&mut visitor);
+    }
+}
+
+const WHOLE: &str = "the model is put back after every change";

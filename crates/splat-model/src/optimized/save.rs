@@ -1,0 +1,110 @@
+//! Values and moments on their way to a checkpoint and back.
+
+use std::collections::BTreeMap;
+
+use burn::module::Module;
+use burn::tensor::{Device, Tensor, TensorData};
+use splat_ops::OpError;
+
+use super::Optimized;
+use super::fields::change;
+use crate::optimizer::StateRecord;
+
+/// Name of a gradient that waits for a step, beside the moments.
+const WAITING: &str = "waiting_gradient";
+
+impl<M: Module> Optimized<M> {
+    /// Values and optimiser states of all fields, on the host: value `means` is tensor `means`, a moment of it
+    /// `means.moment_1`. Values are `[N, width]`.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn save(&self) -> Result<StateRecord, OpError> {
+        let mut record = StateRecord::default();
+        for field in &self.fields {
+            let name = &field.name;
+            let [values] = self.read([name.as_str()])?;
+            let width = self.shapes()[name][1];
+            let rows = values.len() / width.max(1);
+            record
+                .tensors
+                .insert(name.clone(), TensorData::new(values, [rows, width]));
+            let mut state = self.optimizers[name].save();
+            if let Some(waiting) = self.waiting.get(name) {
+                state.tensors.insert(WAITING.to_owned(), waiting.to_data());
+            }
+            let of = |leaf: String| format!("{name}.{leaf}");
+            record.tensors.extend(
+                state
+                    .tensors
+                    .into_iter()
+                    .map(|(leaf, data)| (of(leaf), data)),
+            );
+            record.scalars.extend(
+                state
+                    .scalars
+                    .into_iter()
+                    .map(|(leaf, value)| (of(leaf), value)),
+            );
+        }
+        Ok(record)
+    }
+
+    /// Puts back what [`save`](Self::save) gave, with any number of rows. Parameters keep their ids.
+    ///
+    /// # Errors
+    /// What does not fit the model or its optimisers, naming the field; nothing is changed then but the state of
+    /// optimisers.
+    pub fn restore(&mut self, record: StateRecord, device: &Device) -> Result<(), String> {
+        let mut fields = record.by_field();
+        let shapes = self.shapes();
+        let mut values = BTreeMap::new();
+        let mut rows_of_set = BTreeMap::new();
+        for field in &self.fields {
+            let name = &field.name;
+            let (value, mut state) = match fields.remove(name) {
+                Some((Some(value), state)) => (value, state),
+                _ => return Err(format!("`{name}` is missing")),
+            };
+            let [own_rows, width] = shapes[name];
+            let rows = match (&value.shape()[..], field.row_set) {
+                ([rows, found], Some(_)) if *found == width => *rows,
+                ([rows, found], None) if [*rows, *found] == [own_rows, width] => *rows,
+                (shape, _) => {
+                    return Err(format!(
+                        "`{name}` has shape {shape:?}, the model's has [{own_rows}, {width}]"
+                    ));
+                }
+            };
+            if let Some(set) = field.row_set {
+                let first = *rows_of_set.entry(set).or_insert(rows);
+                if first != rows {
+                    return Err(format!("`{name}` has {rows} rows beside others of {first}"));
+                }
+            }
+            if let Some(waiting) = state.tensors.remove(WAITING) {
+                if waiting.shape()[..] != [rows, width] {
+                    return Err(format!(
+                        "the gradient of `{name}` has shape {:?}",
+                        waiting.shape().to_vec()
+                    ));
+                }
+                self.waiting
+                    .insert(name.clone(), Tensor::from_data(waiting, device));
+            }
+            if let Some(optimizer) = self.optimizers.get_mut(name) {
+                let restored = optimizer.restore(state, [rows, width], device);
+                restored.map_err(|reason| format!("the optimiser of `{name}`: {reason}"))?;
+            }
+            values.insert(name.clone(), Tensor::from_data(value, device));
+        }
+        if let Some(name) = fields.keys().next() {
+            return Err(format!("`{name}` is no field of the model"));
+        }
+        let names = self.names();
+        change(&mut self.model, names, |name, value| {
+            values.remove(name).unwrap_or(value)
+        });
+        Ok(())
+    }
+}
