@@ -3,6 +3,8 @@
 
 #[cfg(feature = "cpu")]
 pub mod accuracy;
+#[cfg(feature = "cpu")]
+pub mod central;
 pub mod gradcheck;
 pub mod memory;
 #[cfg(feature = "cpu")]

@@ -32,6 +32,8 @@ pub(crate) use judge::relative_l2;
 pub use judge::{FileReport, GroupReport, OutputReport, compare, gate};
 pub use report::{json, table};
 pub use run::{Bug, Computed, run};
+#[cfg(feature = "cpu")]
+pub(crate) use scene::index_of;
 pub use scene::{Array, Inputs, Outputs, Scene};
 pub use thresholds::{NEAR, Walk, near_in_single, walk};
 

@@ -89,7 +89,7 @@ pub struct Scene {
 }
 
 /// Position in every dimension of a flat index into a row-major array.
-pub(super) fn index_of(mut flat: usize, shape: &[usize]) -> Vec<usize> {
+pub(crate) fn index_of(mut flat: usize, shape: &[usize]) -> Vec<usize> {
     let mut index = vec![0; shape.len()];
     for (place, length) in index.iter_mut().zip(shape).rev() {
         *place = flat % length.max(&1);

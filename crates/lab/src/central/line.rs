@@ -1,0 +1,173 @@
+//! A function along a line through its inputs.
+
+use std::ops::Range;
+
+use super::CheckError;
+use super::function::Function;
+use super::inputs::Inputs;
+use super::ladder::Sample;
+
+/// What rounding makes of one output's element.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Noise {
+    /// As a multiple of what rounding the element itself makes.
+    pub factor: f64,
+    /// Beside that, whatever the element's size.
+    pub floor: f64,
+}
+
+impl Noise {
+    /// That of a function which is exact but for its last rounding.
+    pub(super) const LEAST: Self = Self {
+        factor: 1.0,
+        floor: 0.0,
+    };
+
+    /// Of differences along one line, at a step of one.
+    pub(super) fn of(self, at: &Sample) -> f64 {
+        ROUNDING * self.factor * at.size + self.floor * at.weight
+    }
+
+    /// What explains that differences along a line are off by `found`, at a step of one.
+    pub(super) fn that_explains(found: f64, at: &Sample) -> Self {
+        let factor = found / (ROUNDING * at.size);
+        if factor <= 4.0 {
+            return Self {
+                factor: factor.max(1.0),
+                floor: 0.0,
+            };
+        }
+        // Rounding inside of the function: in proportion to the outputs, or the same for all.
+        Self {
+            factor,
+            floor: found / at.weight,
+        }
+    }
+}
+
+/// Rounding of two values, halved by the two steps between them.
+const ROUNDING: f64 = 0.5 * f64::EPSILON;
+
+/// Moves of some elements of one input.
+#[derive(Debug, Clone)]
+pub(super) struct Line<'a> {
+    pub input: usize,
+    pub range: Range<usize>,
+    /// Of every element of the input; those outside of `range` stay.
+    pub moves: &'a [f64],
+}
+
+/// Evaluates a function along lines, under fixed weights of its outputs.
+///
+/// Outputs are subtracted element by element before they are summed. What does not change cancels exactly, and rounding is
+/// that of the elements, not that of their sum.
+pub(super) struct Probe<'a> {
+    function: &'a dyn Function,
+    inputs: Inputs,
+    /// Outputs at the inputs.
+    middle: Vec<f64>,
+    weights: Vec<f64>,
+    /// Inputs that are being moved.
+    moved: Inputs,
+}
+
+impl<'a> Probe<'a> {
+    pub(super) fn new(
+        function: &'a dyn Function,
+        inputs: Inputs,
+        middle: Vec<f64>,
+        weights: Vec<f64>,
+    ) -> Self {
+        Self {
+            function,
+            moved: inputs.clone(),
+            inputs,
+            middle,
+            weights,
+        }
+    }
+
+    /// Differences at one step. `None` where an output is not finite.
+    pub(super) fn sample(
+        &mut self,
+        line: &Line,
+        step: f64,
+        noise: Noise,
+    ) -> Result<Option<Sample>, CheckError> {
+        let right = self.at(line, step)?;
+        let left = self.at(line, -step)?;
+        let (mut central, mut jump, mut size, mut weights) = (0.0, 0.0, 0.0, 0.0);
+        for (((right, left), middle), weight) in
+            right.iter().zip(&left).zip(&self.middle).zip(&self.weights)
+        {
+            if !(right.is_finite() && left.is_finite()) {
+                return Ok(None);
+            }
+            if right == middle && left == middle {
+                continue;
+            }
+            central += weight * (right - left);
+            jump += weight * ((right - middle) - (middle - left));
+            let largest = right.abs().max(left.abs()).max(middle.abs());
+            size += (weight * largest).powi(2);
+            weights += weight * weight;
+        }
+        let mut sample = Sample {
+            central: central / (2.0 * step),
+            jump: jump / step,
+            noise: 0.0,
+            size: f64::sqrt(size),
+            weight: f64::sqrt(weights),
+        };
+        sample.noise = noise.of(&sample) / step;
+        Ok(Some(sample))
+    }
+
+    /// Outputs after the moves, `step` times.
+    fn at(&mut self, line: &Line, step: f64) -> Result<Vec<f64>, CheckError> {
+        let range = line.range.clone();
+        let original = &self.inputs.entries[line.input].1.values[range.clone()];
+        let moved = &mut self.moved.entries[line.input].1.values[range.clone()];
+        for ((moved, x), v) in moved
+            .iter_mut()
+            .zip(original)
+            .zip(&line.moves[range.clone()])
+        {
+            *moved = x + step * v;
+        }
+        let outputs = self.function.outputs(&self.moved);
+        self.moved.entries[line.input].1.values[range].copy_from_slice(original);
+        let mut values: Vec<f64> = Vec::with_capacity(self.middle.len());
+        for output in outputs? {
+            values.extend(output.values);
+        }
+        if values.len() == self.middle.len() {
+            return Ok(values);
+        }
+        Err(CheckError::Outputs(format!(
+            "{} elements at the inputs and {} beside them: their number must not depend on values",
+            self.middle.len(),
+            values.len()
+        )))
+    }
+}
+
+/// The size of each element, as a power of two: steps of it are exact.
+///
+/// That of an element near zero is a hundredth of the others' median.
+pub(super) fn sizes(values: &[f64]) -> Vec<f64> {
+    let mut lengths: Vec<f64> = values
+        .iter()
+        .map(|x| x.abs())
+        .filter(|x| *x > 0.0)
+        .collect();
+    let middle = lengths.len() / 2;
+    let median = match lengths.is_empty() {
+        true => 100.0,
+        false => *lengths.select_nth_unstable_by(middle, f64::total_cmp).1,
+    };
+    values
+        .iter()
+        .map(|x| x.abs().max(0.01 * median).log2().floor().exp2())
+        .collect()
+}

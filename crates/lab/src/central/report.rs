@@ -1,0 +1,290 @@
+//! What a check found, as a table.
+
+use std::fmt;
+
+/// Result of [`gradcheck`](super::gradcheck) or of [`Fixture::check`](super::Fixture::check).
+///
+/// `Display` prints a table with one row per input, and a line for each finding.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Report {
+    /// What the derivatives are compared with: `numeric` or `expected`.
+    pub compared_with: &'static str,
+    /// One per input, in order; for a fixture, one per output too.
+    pub rows: Vec<Row>,
+}
+
+/// What was found in one tensor.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Row {
+    /// Its name.
+    pub name: String,
+    /// Its shape.
+    pub shape: Vec<usize>,
+    /// How it was looked at.
+    pub coverage: Coverage,
+    /// The comparison that came closest to failing, or failed most; `None` where nothing was compared.
+    pub worst: Option<Comparison>,
+    /// What is wrong, and kinks. No more than eight; then there may be more.
+    pub findings: Vec<Finding>,
+}
+
+/// How a tensor was looked at.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Coverage {
+    /// Element by element.
+    Elements(usize),
+    /// Along random directions over all of its elements.
+    Directions {
+        /// How many.
+        count: usize,
+        /// The smallest error of a single element's derivative that is surely seen, in units of the root mean square
+        /// derivative; both times the element's size.
+        limit: f64,
+    },
+    /// Not at all: it is a constant.
+    Constant,
+}
+
+/// An analytic derivative beside the one it is compared with.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Comparison {
+    /// Index of the element; `None` for a direction over all of them.
+    pub at: Option<Vec<usize>>,
+    /// What the function's own gradient says.
+    pub analytic: f64,
+    /// What it is compared with.
+    pub numeric: f64,
+    /// How far `numeric` may be off.
+    pub error: f64,
+}
+
+/// Something that was found at one element.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Finding {
+    /// What it is.
+    pub kind: Kind,
+    /// Where, and the numbers.
+    pub comparison: Comparison,
+}
+
+/// Kinds of findings.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Kind {
+    /// The analytic derivative is not the numeric one.
+    Wrong,
+    /// Autodiff has no gradient, though the function depends on the input.
+    NoGradient,
+    /// The derivatives on the left and on the right differ.
+    Kink {
+        /// Towards smaller values.
+        left: f64,
+        /// Towards larger values.
+        right: f64,
+        /// Whether it passes: the analytic derivative lies between both, and kinks are not refused.
+        accepted: bool,
+    },
+    /// The numeric derivative cannot be told: a discontinuity, noise, or a function that changes faster than the steps.
+    Unresolved,
+    /// The function is not finite at any step beside this point.
+    OutsideDomain,
+}
+
+impl Kind {
+    /// Whether it fails the check.
+    pub fn fails(self) -> bool {
+        !matches!(self, Self::Kink { accepted: true, .. })
+    }
+}
+
+/// The first thing that fails a check, in words.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+#[error("{0}")]
+pub struct Failure(String);
+
+impl Report {
+    /// Whether no finding fails.
+    pub fn is_ok(&self) -> bool {
+        self.failure().is_none()
+    }
+
+    /// The report if it is ok.
+    ///
+    /// # Errors
+    /// Otherwise a message with input, element, numbers, and what to do.
+    pub fn check(self) -> Result<Self, Failure> {
+        match self.failure() {
+            None => Ok(self),
+            Some((row, finding)) => Err(Failure(self.sentence(row, finding))),
+        }
+    }
+
+    /// Nothing if the report is ok. For tests.
+    ///
+    /// # Panics
+    /// Otherwise, with the table.
+    #[track_caller]
+    pub fn expect(&self) {
+        assert!(self.is_ok(), "{self}");
+    }
+
+    /// The row of an input; `None` for an unknown name.
+    pub fn row(&self, name: &str) -> Option<&Row> {
+        self.rows.iter().find(|row| row.name == name)
+    }
+
+    /// The largest difference of any row's worst comparison, relative to the larger of both derivatives.
+    pub fn worst_relative(&self) -> f64 {
+        let worst = self.rows.iter().filter_map(|row| row.worst.as_ref());
+        worst.map(Comparison::relative).fold(0.0, f64::max)
+    }
+
+    fn failure(&self) -> Option<(&Row, &Finding)> {
+        let findings = self
+            .rows
+            .iter()
+            .flat_map(|row| row.findings.iter().map(move |finding| (row, finding)));
+        findings.into_iter().find(|(_, f)| f.kind.fails())
+    }
+
+    fn sentence(&self, row: &Row, finding: &Finding) -> String {
+        let name = &row.name;
+        let c = &finding.comparison;
+        let place = c.place();
+        let (analytic, numeric, error) = (c.analytic, c.numeric, c.error);
+        let with = self.compared_with;
+        match finding.kind {
+            Kind::Wrong => format!(
+                "`{name}` {place}: analytic {analytic:e}, {with} {numeric:e} (+- {error:.0e}); the gradient is wrong there, \
+                 correct the backward pass"
+            ),
+            Kind::NoGradient => format!(
+                "`{name}` {place}: no gradient, {with} {numeric:e} (+- {error:.0e}); is it detached, or missing in the \
+                 backward pass? Otherwise declare it a constant"
+            ),
+            Kind::Kink {
+                left,
+                right,
+                accepted: true,
+            } => format!(
+                "`{name}` {place}: a kink, slopes {left:e} on the left and {right:e} on the right; analytic {analytic:e} is \
+                 accepted"
+            ),
+            Kind::Kink { left, right, .. } => format!(
+                "`{name}` {place}: a kink, slopes {left:e} on the left and {right:e} on the right; analytic {analytic:e} is \
+                 refused: it lies outside of them, or kinks are refused. Choose another point or correct the backward pass"
+            ),
+            Kind::Unresolved => format!(
+                "`{name}` {place}: the {with} derivative {numeric:e} is uncertain by {error:.0e}; is there a jump or noise? \
+                 Choose another point, or a smaller step"
+            ),
+            Kind::OutsideDomain => format!(
+                "`{name}` {place}: the function is not finite beside this point; move it into the domain, or take a smaller \
+                 step"
+            ),
+        }
+    }
+}
+
+impl Comparison {
+    /// The difference relative to the larger of both; 0 where they are equal.
+    pub fn relative(&self) -> f64 {
+        let difference = (self.analytic - self.numeric).abs();
+        if difference == 0.0 {
+            0.0
+        } else {
+            difference / self.analytic.abs().max(self.numeric.abs())
+        }
+    }
+
+    fn place(&self) -> String {
+        match &self.at {
+            Some(at) => format!("at {at:?}"),
+            None => "along a direction over all elements".into(),
+        }
+    }
+}
+
+impl Row {
+    /// Whether no finding of it fails.
+    pub fn is_ok(&self) -> bool {
+        !self.findings.iter().any(|finding| finding.kind.fails())
+    }
+
+    fn verdict(&self) -> &'static str {
+        let first = self.findings.iter().find(|f| f.kind.fails());
+        match first.or(self.findings.first()).map(|finding| finding.kind) {
+            None => "ok",
+            Some(Kind::Wrong) => "WRONG",
+            Some(Kind::NoGradient) => "NO GRADIENT",
+            Some(Kind::Kink { accepted: true, .. }) => "ok, kink",
+            Some(Kind::Kink { .. }) => "KINK",
+            Some(Kind::Unresolved) => "UNRESOLVED",
+            Some(Kind::OutsideDomain) => "OUTSIDE DOMAIN",
+        }
+    }
+}
+
+impl fmt::Display for Coverage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Elements(1) => f.write_str("1 element"),
+            Self::Elements(count) => write!(f, "{count} elements"),
+            Self::Directions { count, limit } => {
+                write!(f, "{count} directions, sees {limit:.0e} rms")
+            }
+            Self::Constant => f.write_str("constant"),
+        }
+    }
+}
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let wide =
+            |cells: &mut dyn Iterator<Item = usize>, least: usize| cells.fold(least, usize::max);
+        let name = wide(&mut self.rows.iter().map(|row| row.name.chars().count()), 4);
+        let shape = wide(
+            &mut self.rows.iter().map(|row| format!("{:?}", row.shape).len()),
+            5,
+        );
+        let checked = wide(
+            &mut self.rows.iter().map(|row| row.coverage.to_string().len()),
+            7,
+        );
+        let place = |row: &Row| match row.worst.as_ref() {
+            Some(Comparison { at: Some(at), .. }) => format!("{at:?}"),
+            Some(_) => "all".into(),
+            None => "-".into(),
+        };
+        let at = wide(&mut self.rows.iter().map(|row| place(row).len()), 5);
+        writeln!(
+            f,
+            "{:<name$}  {:<shape$}  {:<checked$}  {:<at$}  {:>12}  {:>12}  {:>7}  verdict",
+            "name", "shape", "checked", "worst", "analytic", self.compared_with, "error"
+        )?;
+        for row in &self.rows {
+            let [analytic, numeric, error] = match &row.worst {
+                None => ["-".into(), "-".into(), "-".into()],
+                Some(c) => [
+                    format!("{:.5e}", c.analytic),
+                    format!("{:.5e}", c.numeric),
+                    format!("{:.0e}", c.error),
+                ],
+            };
+            writeln!(
+                f,
+                "{:<name$}  {:<shape$}  {:<checked$}  {:<at$}  {analytic:>12}  {numeric:>12}  {error:>7}  {}",
+                row.name,
+                format!("{:?}", row.shape),
+                row.coverage.to_string(),
+                place(row),
+                row.verdict(),
+            )?;
+        }
+        for row in &self.rows {
+            for finding in &row.findings {
+                writeln!(f, "{}", self.sentence(row, finding))?;
+            }
+        }
+        Ok(())
+    }
+}
