@@ -10,19 +10,11 @@
 //! operation, or about 20.
 
 use cubecl::prelude::*;
+use splat_core::Activation;
 
 use crate::exp::exp;
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
-
-/// A function of one element.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Activation {
-    /// `exp(x)`.
-    Exp,
-    /// `1 / (1 + exp(-x))`.
-    Sigmoid,
-}
 
 /// What the three scales and the opacity of each Gaussian, and their gradients, must move.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {

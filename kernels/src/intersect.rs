@@ -16,18 +16,18 @@
 use std::fmt;
 
 use cubecl::prelude::*;
+use splat_core::{PROJECTED_DEPTH, PROJECTED_EXTENT, PROJECTED_WIDTH, TILE_SIDE};
 
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, per_element};
 use crate::math::is_finite;
-use crate::project::{EXTENT, PACKED};
 use crate::rasterize::MAX_SLOT_VALUES;
 use crate::scan::{PendingTotal, cube_exclusive_sum, exclusive_sum, exclusive_sum_with_total};
 use crate::sort::{bits_for, ordered_bits, sort_first_pairs};
 use crate::work;
 
 /// Side of a tile in pixels.
-pub const TILE: u32 = 16;
+pub const TILE: u32 = TILE_SIDE as u32;
 
 /// Most tiles in the bounding box of a splat whose tiles are tried by one unit.
 const WIDE: u32 = 64;
@@ -252,7 +252,7 @@ impl Footprint {
 /// The footprint of a splat, as it is in memory.
 #[cube]
 fn footprint(packed: &[f32], opacities: &[f32], splat: usize, alpha_min: f32) -> Footprint {
-    let at = splat * PACKED;
+    let at = splat * PROJECTED_WIDTH;
     let mut f = Footprint::new(
         packed[at],
         packed[at + 1],
@@ -262,7 +262,7 @@ fn footprint(packed: &[f32], opacities: &[f32], splat: usize, alpha_min: f32) ->
         opacities[splat],
         alpha_min,
     );
-    f.seen = f.seen && packed[at + EXTENT] > 0.0f32;
+    f.seen = f.seen && packed[at + PROJECTED_EXTENT] > 0.0f32;
     f
 }
 
@@ -349,7 +349,7 @@ fn pack_visible(
     if splat < splats as usize {
         let to = visible[splat];
         if visible[splat + 1] > to {
-            keys[to as usize] = ordered_bits(packed[splat * PACKED + 2]);
+            keys[to as usize] = ordered_bits(packed[splat * PROJECTED_WIDTH + PROJECTED_DEPTH]);
             indices[to as usize] = splat as u32;
         }
     }

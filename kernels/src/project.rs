@@ -18,18 +18,13 @@
 //! gradients of cameras by blocks of Gaussians and then over the blocks, always in the same order: no atomics.
 
 use cubecl::prelude::*;
+use splat_core::{ImageSize, PROJECTED_DEPTH, PROJECTED_WIDTH, ProjectSettings, SPLAT_SIZE_MAX};
 
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
 use crate::math::{Mat3, Quat, Vec3, is_finite};
 
-/// Floats of one projected splat: mean x, y, depth z, w11, w21, w22, compensation, extent x, y.
-pub const PACKED: usize = 9;
-/// Which of them is the extent along x: above zero exactly where the splat was not culled.
-pub(crate) const EXTENT: usize = 7;
-
-/// Splats larger than this many pixels are all alike: constant over any picture.
-const SIZE_MAX: f32 = 1e12;
+const SIZE_MAX: f32 = SPLAT_SIZE_MAX as f32;
 
 /// Values of a camera's gradient: three rows [W | t], then fx, fy, cx, cy.
 const CAMERA_VALUES: usize = 16;
@@ -38,40 +33,8 @@ const CAMERA_ITEMS: usize = 4;
 /// Gaussians that one workgroup of the camera gradient sums.
 const CAMERA_BLOCK: usize = CUBE_UNITS_USIZE * CAMERA_ITEMS;
 
-/// Image size in pixels and settings of the projection.
-#[derive(Clone, Copy, Debug)]
-pub struct ProjectSettings {
-    /// Image width in pixels.
-    pub width: u32,
-    /// Image height in pixels.
-    pub height: u32,
-    /// Smallest camera z that is kept.
-    pub near: f32,
-    /// Largest camera z that is kept.
-    pub far: f32,
-    /// e, added to the diagonal of the screen covariance, in px².
-    pub eps2d: f32,
-    /// How far beyond the image the Jacobian follows the mean, in image widths and heights.
-    pub clamp_margin: f32,
-    /// Alpha below which a splat is not seen: sets the extent.
-    pub alpha_min: f32,
-}
-
-impl ProjectSettings {
-    fn uniforms(&self) -> UniformsLaunch {
-        UniformsLaunch::new(
-            self.width as f32,
-            self.height as f32,
-            self.near,
-            self.far,
-            self.eps2d.sqrt(),
-            self.clamp_margin,
-            (-2.0 * self.alpha_min.ln()).max(0.0).sqrt(),
-        )
-    }
-}
-
-/// [`ProjectSettings`] on the device; `blur` = √e; `reach` = √(2 ln(1/alpha_min)), standard deviations to the edge of a splat.
+/// Image size and [`ProjectSettings`] on the device; `blur` = √e; `reach` = √(2 ln(1/alpha_min)), standard deviations to
+/// the edge of a splat.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 struct Uniforms {
@@ -82,6 +45,18 @@ struct Uniforms {
     blur: f32,
     clamp_margin: f32,
     reach: f32,
+}
+
+fn uniforms(size: ImageSize, settings: &ProjectSettings) -> UniformsLaunch {
+    UniformsLaunch::new(
+        size.width as f32,
+        size.height as f32,
+        settings.near as f32,
+        settings.far as f32,
+        (settings.eps2d as f32).sqrt(),
+        settings.clamp_margin as f32,
+        (-2.0 * (settings.alpha_min as f32).ln()).max(0.0).sqrt(),
+    )
 }
 
 /// The tensors that the projection reads: means [N, 3], quats [N, 4], scales [N, 3], viewmats [C, 4, 4],
@@ -282,10 +257,11 @@ fn project_splat(g: Gaussian, camera: Camera, s: Uniforms) -> Splat {
         && is_finite(extent_x)
         && is_finite(extent_y);
     let in_depth = s.near <= p.z && p.z <= s.far;
-    let on_screen = mean_x + extent_x >= 0.0f32
-        && mean_x - extent_x <= s.width
-        && mean_y + extent_y >= 0.0f32
-        && mean_y - extent_y <= s.height;
+    // Strict, as `splat_core` says of culling.
+    let on_screen = mean_x + extent_x > 0.0f32
+        && mean_x - extent_x < s.width
+        && mean_y + extent_y > 0.0f32
+        && mean_y - extent_y < s.height;
 
     Splat {
         visible: finite && in_depth && on_screen && g.quat.max_abs() > 0.0f32,
@@ -340,11 +316,11 @@ fn project_forward(
         let g = Gaussian::load(means, quats, scales, index % gaussians);
         let camera = Camera::load(viewmats, intrinsics, index / gaussians);
         let splat = project_splat(g, camera, s);
-        let at = index * PACKED;
+        let at = index * PROJECTED_WIDTH;
         if splat.visible {
             packed[at] = splat.mean_x;
             packed[at + 1] = splat.mean_y;
-            packed[at + 2] = splat.p.z;
+            packed[at + PROJECTED_DEPTH] = splat.p.z;
             packed[at + 3] = splat.w11 / splat.k;
             packed[at + 4] = splat.w21 / splat.k;
             packed[at + 5] = splat.w22 / splat.k;
@@ -352,7 +328,7 @@ fn project_forward(
             packed[at + 7] = splat.extent_x;
             packed[at + 8] = splat.extent_y;
         } else {
-            for k in 0..PACKED {
+            for k in 0..PROJECTED_WIDTH {
                 packed[at + k] = 0.0f32;
             }
         }
@@ -374,10 +350,15 @@ pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     ]
 }
 
-/// Projects every Gaussian to every camera: packed splats [C, N, 9] ([`PACKED`]), all zero where culled.
-pub fn project(client: &Client, inputs: &ProjectInputs, settings: &ProjectSettings) -> Buffer {
+/// Projects every Gaussian to every camera: packed splats [C, N, 9], all zero where culled.
+pub fn project(
+    client: &Client,
+    inputs: &ProjectInputs,
+    size: ImageSize,
+    settings: &ProjectSettings,
+) -> Buffer {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
-    let packed = Buffer::empty(client, cameras * gaussians * PACKED);
+    let packed = Buffer::empty(client, cameras * gaussians * PROJECTED_WIDTH);
     if let Some((count, dim)) = per_element(cameras * gaussians) {
         project_forward::launch(
             client,
@@ -391,7 +372,7 @@ pub fn project(client: &Client, inputs: &ProjectInputs, settings: &ProjectSettin
             packed.arg(),
             gaussians as u32,
             cameras as u32,
-            settings.uniforms(),
+            uniforms(size, settings),
         );
     }
     packed
@@ -559,7 +540,7 @@ fn project_backward_gaussians(
             let camera = Camera::load(viewmats, intrinsics, c);
             let splat = project_splat(g, camera, s);
             if splat.visible {
-                let at = (c * gaussians + index) * PACKED;
+                let at = (c * gaussians + index) * PROJECTED_WIDTH;
                 let grad = project_vjp(g, camera, splat, grad_packed, at);
                 mean_x += grad.mean.x;
                 mean_y += grad.mean.y;
@@ -621,7 +602,7 @@ fn project_backward_cameras(
                 let g = Gaussian::load(means, quats, scales, index);
                 let splat = project_splat(g, camera, s);
                 if splat.visible {
-                    let at = (c * gaussians + index) * PACKED;
+                    let at = (c * gaussians + index) * PROJECTED_WIDTH;
                     let grad = project_vjp(g, camera, splat, grad_packed, at);
                     sums[0] += grad.w.r0.x;
                     sums[1] += grad.w.r0.y;
@@ -702,6 +683,7 @@ pub fn project_backward(
     client: &Client,
     inputs: &ProjectInputs,
     grad_packed: &Buffer,
+    size: ImageSize,
     settings: &ProjectSettings,
     wanted: [bool; 5],
 ) -> [Option<Buffer>; 5] {
@@ -735,7 +717,7 @@ pub fn project_backward(
             grads[2].arg(),
             gaussians as u32,
             cameras as u32,
-            settings.uniforms(),
+            uniforms(size, settings),
             [wanted[0], wanted[1], wanted[2]],
         );
     }
@@ -757,7 +739,7 @@ pub fn project_backward(
                 gaussians as u32,
                 cameras as u32,
                 blocks as u32,
-                settings.uniforms(),
+                uniforms(size, settings),
             );
         }
         if let Some((count, dim)) = per_element(cameras * CAMERA_VALUES) {

@@ -25,6 +25,7 @@ mod sums;
 mod tile;
 
 use cubecl::prelude::*;
+use splat_core::PROJECTED_WIDTH;
 
 use self::background::background_gradient;
 use self::backward::{SHAPE_GRADIENTS, SlotLayout, rasterize_backward};
@@ -37,7 +38,6 @@ use crate::floor::{Bytes, Sizes};
 use crate::intersect::{Frames, IntersectError, Slots, TileLists, intersect_ahead};
 use crate::launch::{Buffer, cube_count, per_element};
 use crate::math::is_finite;
-use crate::project::PACKED;
 
 /// Most channels of one launch; fewer where a unit has many pixels.
 pub const MAX_CHANNELS: usize = 32;
@@ -62,6 +62,20 @@ pub struct RasterizeSettings {
     pub transmittance_min: f32,
     /// How gradients of one splat from many tiles are summed.
     pub sums: Sums,
+}
+
+impl From<&splat_core::RasterizeSettings> for RasterizeSettings {
+    fn from(settings: &splat_core::RasterizeSettings) -> Self {
+        Self {
+            alpha_max: settings.alpha_max as f32,
+            transmittance_min: settings.transmittance_min as f32,
+            sums: if settings.deterministic {
+                Sums::Ordered
+            } else {
+                Sums::Atomic
+            },
+        }
+    }
 }
 
 /// What a forward pass leaves for its backward pass.
@@ -204,7 +218,7 @@ pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let (i, pixels, color) = (sizes.instances, sizes.pixels(), 4 * sizes.channels);
     // In the gradient: its sums per instance, written and read again, and what becomes of them per Gaussian.
     let sums = (24 + color) * i;
-    let packed_and_opacity = 4 * (PACKED as u64 + 1);
+    let packed_and_opacity = 4 * (PROJECTED_WIDTH as u64 + 1);
     [
         Bytes {
             read: (28 + color) * i,
@@ -359,7 +373,7 @@ pub fn rasterize_vjp(
         Sums::Atomic | Sums::Exchange => zeros(client, len),
     };
     let gradients = [
-        reserve(shape, splats * PACKED),
+        reserve(shape, splats * PROJECTED_WIDTH),
         reserve(wants_colors, splats * channels),
         reserve(shape, splats),
     ];

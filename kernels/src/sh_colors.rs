@@ -16,15 +16,17 @@
 
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
+use splat_core::{
+    ClampGradient, PROJECTED_EXTENT, PROJECTED_WIDTH, ShColorSettings, sh_coefficient_count,
+};
 
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{
     Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, F16, F32, HalfBuffer, cube_count, per_element,
 };
 use crate::math::{Vec3, is_below_zero};
-use crate::project::{EXTENT, PACKED};
 use crate::reduce::{sum_blocks, sum_units};
-use crate::sh::{basis, direction_vjp, functions, guarded_dot, inverse_length, usable_degree};
+use crate::sh::{basis, direction_vjp, guarded_dot, inverse_length, usable_degree};
 
 /// Gaussians that one unit of the centres' gradient sums.
 const CENTER_ITEMS: usize = 4;
@@ -34,7 +36,7 @@ const CENTER_BLOCK: usize = CUBE_UNITS_USIZE * CENTER_ITEMS;
 /// What forward and gradient must move for one camera.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let (n, seen) = (sizes.gaussians, sizes.visible);
-    let coefficients = 12 * functions(sizes.degree) as u64;
+    let coefficients = 12 * sh_coefficient_count(sizes.degree) as u64;
     [
         Bytes {
             read: (12 + coefficients) * seen + 4 * n,
@@ -148,7 +150,7 @@ fn coefficient<R: Float>(rest: &[R], at: usize) -> Vec3 {
 #[cube]
 fn is_seen(packed: &[f32], index: usize, #[comptime] asked: bool) -> bool {
     if comptime!(asked) {
-        packed[index * PACKED + EXTENT] > 0.0f32
+        packed[index * PROJECTED_WIDTH + PROJECTED_EXTENT] > 0.0f32
     } else {
         true.runtime()
     }
@@ -170,7 +172,7 @@ fn unclamped<R: Float>(
     let mut blue = first.z;
     let from = gaussian * stored * 3;
     #[unroll]
-    for k in 1..comptime!(functions(degree)) {
+    for k in 1..comptime!(sh_coefficient_count(degree)) {
         let coefficient = coefficient::<R>(rest, from + (k - 1) * 3);
         red = fma(y[k], coefficient.x, red);
         green = fma(y[k], coefficient.y, green);
@@ -206,7 +208,7 @@ fn sh_colors_forward<R: Float>(
         if is_seen(packed, index, asked) {
             let gaussian = index % gaussians;
             let sight = sight(means, centers, gaussian, index / gaussians);
-            let mut y = Array::<f32>::new(comptime!(functions(degree)));
+            let mut y = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
             basis(sight.unit, &mut y, degree);
             let color = unclamped::<R>(sh0, rest, &y, gaussian, stored as usize, degree);
             Vec3::new(clamped(color.x), clamped(color.y), clamped(color.z))
@@ -217,8 +219,8 @@ fn sh_colors_forward<R: Float>(
     }
 }
 
-/// Colours [C, N, 3]. `degree` is cut to [`crate::sh::MAX_DEGREE`] and to what is stored.
-pub fn sh_colors(client: &Client, inputs: &ShInputs, degree: usize) -> Buffer {
+/// Colours [C, N, 3]. The degree is cut to [`SH_DEGREE_MAX`](splat_core::SH_DEGREE_MAX) and to what is stored.
+pub fn sh_colors(client: &Client, inputs: &ShInputs, settings: ShColorSettings) -> Buffer {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
     let colors = Buffer::empty(client, cameras * gaussians * 3);
     let (rest, stored_as) = inputs.rest();
@@ -237,7 +239,7 @@ pub fn sh_colors(client: &Client, inputs: &ShInputs, degree: usize) -> Buffer {
             gaussians as u32,
             cameras as u32,
             inputs.stored as u32,
-            inputs.degree(degree),
+            inputs.degree(settings.degree),
             asked,
             stored_as,
         );
@@ -275,12 +277,12 @@ fn sight_vjp<R: Float>(
     stored: usize,
     #[comptime] degree: usize,
 ) -> Vec3 {
-    let mut weights = Array::<f32>::new(comptime!(functions(degree)));
+    let mut weights = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
     // The function of degree 0 does not look at the direction.
     weights[0] = 0.0f32;
     let from = gaussian * stored * 3;
     #[unroll]
-    for k in 1..comptime!(functions(degree)) {
+    for k in 1..comptime!(sh_coefficient_count(degree)) {
         weights[k] = guarded_dot(g, coefficient::<R>(rest, from + (k - 1) * 3));
     }
     direction_vjp(sight.unit, sight.inverse, &weights, degree)
@@ -311,10 +313,10 @@ fn sh_colors_backward_gaussians<R: Float>(
     let stored = stored as usize;
     let gaussian = ABSOLUTE_POS;
     if gaussian < gaussians {
-        let mut y = Array::<f32>::new(comptime!(functions(degree)));
-        let mut sums = Array::<f32>::new(comptime!(3 * functions(degree)));
+        let mut y = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
+        let mut sums = Array::<f32>::new(comptime!(3 * sh_coefficient_count(degree)));
         #[unroll]
-        for k in 0..comptime!(3 * functions(degree)) {
+        for k in 0..comptime!(3 * sh_coefficient_count(degree)) {
             sums[k] = 0.0f32;
         }
         let mut mean_x = 0.0f32;
@@ -331,7 +333,7 @@ fn sh_colors_backward_gaussians<R: Float>(
                 let g = passed_on(color, g, recovers);
                 if comptime!(wanted[0] || wanted[1]) {
                     #[unroll]
-                    for k in 0..comptime!(functions(degree)) {
+                    for k in 0..comptime!(sh_coefficient_count(degree)) {
                         sums[k * 3] += y[k] * g.x;
                         sums[k * 3 + 1] += y[k] * g.y;
                         sums[k * 3 + 2] += y[k] * g.z;
@@ -351,10 +353,10 @@ fn sh_colors_backward_gaussians<R: Float>(
         if comptime!(wanted[1]) {
             let to = gaussian * stored * 3;
             #[unroll]
-            for k in 3..comptime!(3 * functions(degree)) {
+            for k in 3..comptime!(3 * sh_coefficient_count(degree)) {
                 grad_rest[to + k - 3] = sums[k];
             }
-            for k in comptime!(3 * functions(degree) - 3)..stored * 3 {
+            for k in comptime!(3 * sh_coefficient_count(degree) - 3)..stored * 3 {
                 grad_rest[to + k] = 0.0f32;
             }
         }
@@ -400,7 +402,7 @@ fn sh_colors_backward_centers<R: Float>(
                 // As above: what is broken and not seen must not reach the camera.
                 if g.max_abs() != 0.0f32 && is_seen(packed, index, asked) {
                     let sight = sight(means, centers, gaussian, camera);
-                    let mut values = Array::<f32>::new(comptime!(functions(degree)));
+                    let mut values = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
                     basis(sight.unit, &mut values, degree);
                     let color = unclamped::<R>(sh0, rest, &values, gaussian, stored, degree);
                     let g = passed_on(color, g, recovers);
@@ -421,17 +423,17 @@ fn sh_colors_backward_centers<R: Float>(
 }
 
 /// Gradients of sh0 [N, 1, 3], `sh_rest` [N, R, 3], means [N, 3] and centres [C, 3] for that of the colours [C, N, 3];
-/// only those `wanted`. With `recovers`, a channel that is clamped passes on a gradient whose descent raises it.
+/// only those `wanted`.
 pub fn sh_colors_backward(
     client: &Client,
     inputs: &ShInputs,
     grad_colors: &Buffer,
-    degree: usize,
-    recovers: bool,
+    settings: ShColorSettings,
     wanted: [bool; 4],
 ) -> [Option<Buffer>; 4] {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
-    let degree = inputs.degree(degree);
+    let degree = inputs.degree(settings.degree);
+    let recovers = settings.clamp_gradient == ClampGradient::Recovering;
     let lens = [gaussians * 3, gaussians * inputs.stored * 3, gaussians * 3];
     // An unwanted gradient still needs something to bind.
     let grads: [Buffer; 3] =

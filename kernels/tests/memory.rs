@@ -28,7 +28,7 @@ fn a_picture_keeps_the_bytes_that_are_stated() {
             gaussians: splats,
             width,
             height: 128,
-            alpha_min: 1.0 / 255.0,
+            alpha_min: splat_core::ALPHA_MIN as f32,
         };
         let mut packed = Vec::new();
         for i in 0..splats {

@@ -7,8 +7,9 @@ mod alone;
 
 use alone::alone;
 use cubecl::client::Client;
-use splat_kernels::activation::{Activation, activate};
-use splat_kernels::adam::{AdamRows, AdamStep, adam};
+use splat_core::{Activation, AdamRows, AdamStep};
+use splat_kernels::activation::activate;
+use splat_kernels::adam::adam;
 use splat_kernels::intersect::Frames;
 use splat_kernels::rasterize::{RasterizeInputs, RasterizeSettings, Sums, rasterize};
 use splat_kernels::screen_statistics::screen_statistics;
@@ -40,7 +41,7 @@ fn render(client: &Client, splats: usize, spread: f32) -> (Vec<f32>, Work) {
         gaussians: splats,
         width: 160,
         height: 128,
-        alpha_min: 1.0 / 255.0,
+        alpha_min: splat_core::ALPHA_MIN as f32,
     };
     let mut packed = Vec::new();
     for i in 0..splats {
@@ -126,7 +127,7 @@ fn a_step_of_adam_takes_no_memory_but_for_what_something_else_holds() {
         return;
     };
     let grad = Buffer::from_f32(&client, &[1.0; 6]);
-    for rows in [AdamRows::All, AdamRows::Seen { width: 3 }] {
+    for rows in [AdamRows::All, AdamRows::Seen] {
         let step = AdamStep {
             beta_1: 0.5,
             beta_2: 0.5,
@@ -137,7 +138,7 @@ fn a_step_of_adam_takes_no_memory_but_for_what_something_else_holds() {
         let three = || [(); 3].map(|()| Buffer::from_f32(&client, &[0.0; 6]));
         let reserved = |[param, moment_1, moment_2]: [Buffer; 3]| {
             let before = work();
-            let after = adam(&client, param, &grad, [moment_1, moment_2], &step);
+            let after = adam(&client, param, &grad, [moment_1, moment_2], &step, 3);
             let done = work().since(before);
             assert_eq!(done.launches, 1);
             let expected = [-f32::sqrt(0.5), 0.5, 0.5];

@@ -10,7 +10,7 @@ pub struct ImageSize {
 }
 
 /// Smallest opacity that still changes an 8-bit image (3DGS appendix C).
-const ALPHA_MIN: f64 = 1.0 / 255.0;
+pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 
 /// Settings of `project`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -98,4 +98,51 @@ impl From<usize> for ShColorSettings {
             ..Self::default()
         }
     }
+}
+
+/// A function of one element.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Activation {
+    /// `exp(x)`.
+    Exp,
+    /// `1 / (1 + exp(-x))`.
+    Sigmoid,
+}
+
+/// The numbers of one step of Adam; the bias corrections are already in `rate` and `epsilon`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdamStep {
+    /// Decay of the first moment.
+    pub beta_1: f64,
+    /// Decay of the second moment.
+    pub beta_2: f64,
+    /// Learning rate times `sqrt(1 - beta_2^t) / (1 - beta_1^t)`.
+    pub rate: f64,
+    /// Added to the root of the second moment; epsilon times `sqrt(1 - beta_2^t)`.
+    pub epsilon: f64,
+    /// Which rows take the step.
+    pub rows: AdamRows,
+}
+
+/// Which rows of a parameter, along its first dimension, a step changes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum AdamRows {
+    /// All, as Adam is defined: where the gradient is zero, moments decay and parameters drift on.
+    #[default]
+    All,
+    /// Those whose gradient is not all zero, NaN counting as zero; the others keep parameter and moments, as if the step
+    /// had not been for them (the sparse Adam of Mallick et al. 2024, *Taming 3DGS*; `SelectiveAdam` of gsplat). Another
+    /// optimiser with other results, and faster where most Gaussians are out of view.
+    Seen,
+}
+
+/// Window and constants of structural similarity.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SsimArgs {
+    /// Weights along one axis, symmetric, of odd length.
+    pub window: Vec<f64>,
+    /// Constant of the luminance term.
+    pub c1: f64,
+    /// Constant of the contrast term.
+    pub c2: f64,
 }

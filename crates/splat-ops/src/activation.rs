@@ -4,15 +4,7 @@ use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 
 use crate::backend::SplatOps;
-
-/// A function of one element.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Activation {
-    /// `exp(x)`.
-    Exp,
-    /// `1 / (1 + exp(-x))`.
-    Sigmoid,
-}
+use crate::settings::Activation;
 
 /// `exp(x)`, of logarithms of scales for example. The same function as [`Tensor::exp`], to 2 units in the last place on
 /// every device; on the CPU in SIMD and parallel.

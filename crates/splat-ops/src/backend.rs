@@ -11,11 +11,11 @@ use burn::backend::{
 #[allow(unused_imports)]
 use burn::backend::{Autodiff, Dispatch};
 
-use crate::activation::Activation;
-use crate::adam::AdamStep;
 use crate::composed;
+use crate::settings::Activation;
+use crate::settings::AdamStep;
+use crate::settings::SsimArgs;
 use crate::settings::{ProjectArgs, RasterizeArgs, ShColorSettings};
-use crate::ssim::SsimArgs;
 
 pub use splat_core::{PROJECTED_EXTENT, PROJECTED_WIDTH};
 

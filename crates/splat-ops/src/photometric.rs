@@ -6,7 +6,7 @@ use burn::tensor::{Int, Tensor};
 use crate::OpError;
 use crate::backend::{self, SplatOps};
 use crate::check::Checker;
-use crate::ssim::SsimArgs;
+use crate::settings::SsimArgs;
 
 /// What [`photometric`] compares with, `[B, H, W, D]`.
 #[derive(Debug, Clone)]

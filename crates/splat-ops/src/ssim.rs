@@ -8,17 +8,7 @@ use burn::tensor::Tensor;
 use crate::OpError;
 use crate::backend::SplatOps;
 use crate::check::Checker;
-
-/// Window and constants of [`ssim_map`].
-#[derive(Debug, Clone, PartialEq)]
-pub struct SsimArgs {
-    /// Weights along one axis, symmetric, of odd length.
-    pub window: Vec<f64>,
-    /// Constant of the luminance term.
-    pub c1: f64,
-    /// Constant of the contrast term.
-    pub c2: f64,
-}
+use crate::settings::SsimArgs;
 
 /// Structural similarity of two images `[B, H, W, D]` at every pixel and channel, `[B, H, W, D]`, zeros outside of
 /// the images:

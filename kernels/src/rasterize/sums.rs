@@ -11,9 +11,9 @@ use cubecl::client::Client;
 use cubecl::features::AtomicUsage;
 use cubecl::ir::Type;
 use cubecl::prelude::*;
+use splat_core::PROJECTED_WIDTH;
 
 use super::backward::SlotLayout;
-use crate::project::PACKED;
 
 /// How gradients of one splat from many tiles are summed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -105,7 +105,7 @@ pub(super) fn add_to_splat<A: Numeric>(
             add(&gradients.opacities[splat], sum, sums);
         } else {
             add(
-                &gradients.packed[splat * PACKED + packed_entry(value)],
+                &gradients.packed[splat * PROJECTED_WIDTH + packed_entry(value)],
                 sum,
                 sums,
             );
@@ -196,7 +196,7 @@ fn spread(
             grad_colors[splat * channels + channel] = sum;
         }
     } else if comptime!(layout.shape) {
-        let at = splat * PACKED + packed_entry(value);
+        let at = splat * PROJECTED_WIDTH + packed_entry(value);
         if comptime!(first_launch) {
             if value == 5 {
                 grad_opacities[splat] = sum;
@@ -205,7 +205,8 @@ fn spread(
             }
             if value < 4 {
                 // The entries without gradient: depth, compensation, extents.
-                grad_packed[splat * PACKED + select(value == 0, 2usize, value + 5)] = 0.0f32;
+                grad_packed[splat * PROJECTED_WIDTH + select(value == 0, 2usize, value + 5)] =
+                    0.0f32;
             }
         } else if value == 5 {
             grad_opacities[splat] += sum;

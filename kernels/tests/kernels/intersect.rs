@@ -6,7 +6,7 @@ use splat_kernels::intersect::{Frames, TILE, TileLists, intersect};
 use crate::device::{client, download_u32, rng, upload, wide};
 use crate::reference::raw_alpha;
 
-const ALPHA_MIN: f32 = 1.0 / 255.0;
+const ALPHA_MIN: f32 = splat_core::ALPHA_MIN as f32;
 
 /// A packed row with the covariance R diag(a², b²) Rᵀ + 0.3 I.
 fn row(x: f32, y: f32, depth: f32, a: f64, b: f64, angle: f64) -> [f32; 9] {

@@ -61,7 +61,7 @@ impl Scene {
                 gaussians,
                 width,
                 height,
-                alpha_min: 1.0 / 255.0,
+                alpha_min: splat_core::ALPHA_MIN as f32,
             },
             channels,
             packed,
@@ -486,7 +486,7 @@ fn evaluations_are_counted() {
         for &i in &order {
             until_stop += 1;
             let raw = reference::raw_alpha(&packed[i * 9..i * 9 + 9], opacities[i], x, y);
-            if raw < 1.0 / 255.0 {
+            if raw < splat_core::ALPHA_MIN {
                 continue;
             }
             let next = t * (1.0 - raw.min(0.99));

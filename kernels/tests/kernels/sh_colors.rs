@@ -29,8 +29,8 @@ fn bits(client: &Client, inputs: &ShInputs, grad: &Buffer, degree: usize) -> Vec
         values.iter().map(|value| value.to_bits()).collect()
     };
     let wanted = [true, false, true, true];
-    let grads = sh_colors_backward(client, inputs, grad, degree, false, wanted);
-    let mut found = vec![read(&sh_colors(client, inputs, degree))];
+    let grads = sh_colors_backward(client, inputs, grad, degree.into(), wanted);
+    let mut found = vec![read(&sh_colors(client, inputs, degree.into()))];
     found.extend(grads.iter().flatten().map(read));
     assert_eq!(found.len(), 4);
     found

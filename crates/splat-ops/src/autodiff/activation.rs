@@ -6,8 +6,8 @@ use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
 use super::register;
-use crate::activation::Activation;
 use crate::backend::SplatBackend;
+use crate::settings::Activation;
 
 #[derive(Debug)]
 struct ActivationBackward;

@@ -17,11 +17,11 @@ use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::autodiff::grads::Gradients;
 use burn::backend::{Autodiff, AutodiffBackend, tensor::FloatTensor};
 
-use crate::activation::Activation;
-use crate::adam::AdamStep;
 use crate::backend::{AdamTensors, Optional, SplatBackend, SplatOps, StatisticsTensors, Target};
+use crate::settings::Activation;
+use crate::settings::AdamStep;
+use crate::settings::SsimArgs;
 use crate::settings::{ProjectArgs, RasterizeArgs, ShColorSettings};
-use crate::ssim::SsimArgs;
 
 impl<B: SplatBackend, C: CheckpointStrategy> SplatOps for Autodiff<B, C> {
     fn project(

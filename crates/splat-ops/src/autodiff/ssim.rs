@@ -7,7 +7,7 @@ use burn::backend::{Autodiff, tensor::FloatTensor};
 
 use super::register;
 use crate::backend::SplatBackend;
-use crate::ssim::SsimArgs;
+use crate::settings::SsimArgs;
 
 #[derive(Debug)]
 struct SsimBackward;

@@ -7,7 +7,8 @@ use burn::backend::{Backend, TensorMetadata};
 use burn::tensor::{Shape, Slice};
 
 use crate::backend::{SplatBackend, Target};
-use crate::ssim::{SsimArgs, counted};
+use crate::settings::SsimArgs;
+use crate::ssim::counted;
 
 /// A, B, C, D of the structural similarity `A C / (B D)`, from the four windowed means.
 fn ssim_terms<B: Backend>(moments: &[FloatTensor<B>], args: &SsimArgs) -> [FloatTensor<B>; 4] {

@@ -11,7 +11,7 @@ use super::buffer::Buffer;
 use super::parts::Uncleared;
 use super::real::Real;
 use super::simd::vectorized;
-use crate::activation::Activation;
+use crate::settings::Activation;
 
 /// Elements per unit of parallel work.
 const CHUNK: usize = 8192;

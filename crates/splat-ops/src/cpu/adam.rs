@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use super::buffer::{Buffer, BufferMut};
 use super::real::Real;
 use super::simd::vectorized;
-use crate::adam::{AdamRows, AdamStep};
+use crate::settings::{AdamRows, AdamStep};
 
 /// Elements per unit of parallel work, about.
 const CHUNK: usize = 8192;

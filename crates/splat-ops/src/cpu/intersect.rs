@@ -19,10 +19,11 @@ use crate::OpError;
 use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH};
 use crate::settings::RasterizeArgs;
 use emit::{Emission, Emitted, emit};
+use splat_core::TILE_SIDE;
 use splat_core::memory::{in_units, lacking};
 
 /// Side of a tile in pixels.
-pub(super) const TILE: usize = 16;
+pub(super) const TILE: usize = TILE_SIDE;
 
 /// Splats per unit of parallel work.
 pub(super) const CHUNK: usize = 256;

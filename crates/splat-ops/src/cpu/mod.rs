@@ -37,12 +37,12 @@ pub use instructions::InstructionSet;
 
 pub use rasterize::{RasterizeWork, rasterize_work};
 
-use crate::activation::Activation;
-use crate::adam::AdamStep;
 use crate::backend::{ShInputs, SplatBackend, Target};
 use crate::composed;
+use crate::settings::Activation;
+use crate::settings::AdamStep;
+use crate::settings::SsimArgs;
 use crate::settings::{ProjectArgs, RasterizeArgs, ShColorSettings};
-use crate::ssim::SsimArgs;
 
 /// Runs a generic function in the precision of a tensor. The public ops let only F32 and F64 pass.
 macro_rules! in_precision {

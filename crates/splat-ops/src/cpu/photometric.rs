@@ -16,7 +16,7 @@ use super::buffer::{Buffer, tensor};
 use super::parts::{Part, Uncleared};
 use super::real::Real;
 use crate::backend::Target;
-use crate::ssim::SsimArgs;
+use crate::settings::SsimArgs;
 use pictures::{Pictures, spread};
 use sweep::{Scratch, Sweep};
 

@@ -7,6 +7,7 @@ use core::marker::PhantomData;
 
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
+use splat_core::{SH_C0 as C0, SH_C1 as C1, SH_C2 as C2, SH_C3 as C3};
 
 use super::buffer::{Buffer, overwritten, tensor, zeros};
 use super::math::{Vec3, dot, largest, over, scale};
@@ -16,21 +17,6 @@ use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
 pub(super) const COUNT_MAX: usize = sh_coefficient_count(SH_DEGREE_MAX);
 /// Gaussians per unit of parallel work.
 const CHUNK: usize = 512;
-
-const C0: f64 = 0.282_094_791_773_878_14;
-const C1: f64 = 0.488_602_511_902_919_9;
-const C2: [f64; 3] = [
-    1.092_548_430_592_079_2,
-    0.315_391_565_252_520_05,
-    0.546_274_215_296_039_6,
-];
-const C3: [f64; 5] = [
-    0.590_043_589_926_643_5,
-    2.890_611_442_640_554,
-    0.457_045_799_464_465_8,
-    0.373_176_332_590_115_4,
-    1.445_305_721_320_277,
-];
 
 /// Values of the first `(degree + 1)^2` basis functions in a unit direction; the rest is zero.
 #[inline(always)]

@@ -4,20 +4,13 @@ use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::activation as kernels;
 
 use super::{buffer, prepare, taken};
-use crate::activation::Activation;
-
-fn kernel(function: Activation) -> kernels::Activation {
-    match function {
-        Activation::Exp => kernels::Activation::Exp,
-        Activation::Sigmoid => kernels::Activation::Sigmoid,
-    }
-}
+use crate::settings::Activation;
 
 /// The function of every element.
 pub(super) fn forward(x: CubeTensor, function: Activation) -> CubeTensor {
     let client = x.client.clone();
     let (x, tensor) = taken(prepare(x));
-    tensor(kernels::activate(&client, x, kernel(function)))
+    tensor(kernels::activate(&client, x, function))
 }
 
 /// The gradient of `x`.
@@ -29,10 +22,5 @@ pub(super) fn backward(
     let [x, y] = [x, y].map(prepare);
     let (grad, tensor) = taken(prepare(grad));
     let known = [&buffer(&x), &buffer(&y)];
-    tensor(kernels::activate_vjp(
-        &x.client,
-        known,
-        grad,
-        kernel(function),
-    ))
+    tensor(kernels::activate_vjp(&x.client, known, grad, function))
 }

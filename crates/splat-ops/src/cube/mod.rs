@@ -28,12 +28,12 @@ use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::Buffer;
 use tracing::trace_span;
 
-use crate::activation::Activation;
-use crate::adam::AdamStep;
 use crate::backend::{ShInputs, SplatBackend, Target};
 use crate::composed;
+use crate::settings::Activation;
+use crate::settings::AdamStep;
+use crate::settings::SsimArgs;
 use crate::settings::{ProjectArgs, RasterizeArgs, ShColorSettings};
-use crate::ssim::SsimArgs;
 
 /// A tensor of f32, contiguous.
 fn prepare(tensor: CubeTensor) -> CubeTensor {

@@ -14,7 +14,7 @@ use splat_kernels::photometric::{
 use super::{buffer, prepare, tensor};
 use crate::backend::Target;
 use crate::composed;
-use crate::ssim::SsimArgs;
+use crate::settings::SsimArgs;
 
 fn shape(rendered: &CubeTensor, target: &Target<CubeBackend>, args: &SsimArgs) -> PhotometricShape {
     let target = match target {

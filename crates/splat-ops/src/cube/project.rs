@@ -3,23 +3,11 @@
 use burn::backend::TensorMetadata;
 use burn::tensor::Shape;
 use burn_cubecl::tensor::CubeTensor;
-use splat_kernels::project::{ProjectInputs, ProjectSettings, project, project_backward};
+use splat_kernels::project::{ProjectInputs, project, project_backward};
 
 use super::{buffer, prepare, tensor};
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::ProjectArgs;
-
-fn settings(args: &ProjectArgs) -> ProjectSettings {
-    ProjectSettings {
-        width: args.size.width,
-        height: args.size.height,
-        near: args.settings.near as f32,
-        far: args.settings.far as f32,
-        eps2d: args.settings.eps2d as f32,
-        clamp_margin: args.settings.clamp_margin as f32,
-        alpha_min: args.settings.alpha_min as f32,
-    }
-}
 
 fn inputs(tensors: &[CubeTensor; 5]) -> ProjectInputs {
     let [means, quats, scales, viewmats, intrinsics] = tensors.each_ref().map(buffer);
@@ -41,7 +29,7 @@ pub(super) fn forward(tensors: [CubeTensor; 5], args: &ProjectArgs) -> CubeTenso
         PROJECTED_WIDTH,
     ];
     let means = &tensors[0];
-    let packed = project(&means.client, &inputs(&tensors), &settings(args));
+    let packed = project(&means.client, &inputs(&tensors), args.size, &args.settings);
     tensor(means, packed, Shape::from(shape))
 }
 
@@ -58,7 +46,8 @@ pub(super) fn backward(
         &grad_packed.client,
         &inputs(&tensors),
         &buffer(&grad_packed),
-        &settings(args),
+        args.size,
+        &args.settings,
         wanted,
     );
     core::array::from_fn(|i| {

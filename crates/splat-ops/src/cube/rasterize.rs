@@ -8,26 +8,13 @@ use burn_cubecl::tensor::CubeTensor;
 use cubecl::client::Client;
 use splat_kernels::intersect::{Frames, IntersectError};
 use splat_kernels::rasterize::{
-    RasterizeInputs, RasterizeSettings, RasterizeState, Sums, count_evaluations, rasterize,
-    rasterize_vjp,
+    RasterizeInputs, RasterizeSettings, RasterizeState, count_evaluations, rasterize, rasterize_vjp,
 };
 use splat_kernels::{Buffer, MOST_BUFFERS, bindable_buffers};
 
 use super::{buffer, prepare, tensor};
 use crate::OpError;
 use crate::settings::RasterizeArgs;
-
-fn settings(settings: &crate::RasterizeSettings) -> RasterizeSettings {
-    RasterizeSettings {
-        alpha_max: settings.alpha_max as f32,
-        transmittance_min: settings.transmittance_min as f32,
-        sums: if settings.deterministic {
-            Sums::Ordered
-        } else {
-            Sums::Atomic
-        },
-    }
-}
 
 /// Sizes, from colours `[C, N, D]`.
 fn frames(colors: &CubeTensor, args: &RasterizeArgs) -> Frames {
@@ -125,7 +112,13 @@ pub(super) fn forward(
     ]);
     let client = &prepared.packed.client;
     let rendered = enough_bindings(client).and_then(|()| {
-        rasterize(client, &inputs, &frames, &settings(&args.settings)).map_err(op_error)
+        rasterize(
+            client,
+            &inputs,
+            &frames,
+            &RasterizeSettings::from(&args.settings),
+        )
+        .map_err(op_error)
     });
     match rendered {
         Ok((output, state)) => (tensor(&prepared.packed, output, shape), Some(state)),
@@ -164,7 +157,7 @@ pub(super) fn backward(
         state,
         &buffer(&grad_output),
         &frames(&prepared.colors, args),
-        &settings(&args.settings),
+        &RasterizeSettings::from(&args.settings),
         wanted,
     );
     let like = |grad: Option<Buffer>, input: &CubeTensor| {
@@ -211,7 +204,7 @@ pub(crate) fn work(
         height: size.height,
         alpha_min: settings.alpha_min as f32,
     };
-    let settings = self::settings(settings);
+    let settings = RasterizeSettings::from(settings);
     let (_, state) = rasterize(client, &inputs, &frames, &settings).map_err(op_error)?;
     let count = count_evaluations(client, &inputs, &state, &frames, &settings);
     let count = count.map_err(|what| op_error(IntersectError::Device(what)))?;

@@ -10,7 +10,7 @@ use splat_kernels::sh_colors as kernels;
 
 use super::{buffer, prepare, tensor};
 use crate::backend::ShInputs;
-use crate::settings::{ClampGradient, ShColorSettings};
+use crate::settings::ShColorSettings;
 
 /// The inputs, ready for the kernels.
 struct Prepared {
@@ -58,7 +58,7 @@ impl Prepared {
 pub(super) fn forward(inputs: ShInputs<CubeBackend>, settings: ShColorSettings) -> CubeTensor {
     let inputs = Prepared::new(inputs);
     let (means, centers) = (&inputs.means, &inputs.centers);
-    let colors = kernels::sh_colors(&means.client, &inputs.buffers(), settings.degree);
+    let colors = kernels::sh_colors(&means.client, &inputs.buffers(), settings);
     let shape = [centers.shape()[0], means.shape()[0], 3];
     tensor(means, colors, Shape::from(shape))
 }
@@ -76,8 +76,7 @@ pub(super) fn backward(
         &grad.client,
         &inputs.buffers(),
         &buffer(&grad),
-        settings.degree,
-        settings.clamp_gradient == ClampGradient::Recovering,
+        settings,
         wanted,
     );
     let like = |grad: Option<_>, input: &CubeTensor| Some(tensor(input, grad?, input.shape()));

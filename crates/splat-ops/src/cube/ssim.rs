@@ -6,7 +6,7 @@ use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::ssim::{SsimShape, ssim, ssim_vjp};
 
 use super::{buffer, prepare, tensor};
-use crate::ssim::SsimArgs;
+use crate::settings::SsimArgs;
 
 fn shape(image: &CubeTensor, args: &SsimArgs) -> SsimShape {
     let shape = image.shape();

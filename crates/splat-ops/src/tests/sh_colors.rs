@@ -202,7 +202,7 @@ fn what_a_camera_culled_is_black_and_gets_no_gradient() {
 /// not clamped both are the same.
 #[test]
 fn a_channel_below_zero_can_recover_if_asked_to() {
-    const Y0: f32 = 0.282_094_8;
+    const Y0: f32 = splat_core::SH_C0 as f32;
     let below = -2.0f32;
     for (name, device) in devices() {
         let device = device.autodiff();

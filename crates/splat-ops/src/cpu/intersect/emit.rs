@@ -309,7 +309,7 @@ mod tests {
                     let (dx, dy) = (x as f64 + 0.5 - wide[0], y as f64 + 0.5 - wide[1]);
                     let (z1, z2) = (wide[3] * dx, wide[4] * dx + wide[5] * dy);
                     let alpha = f64::from(*opacity) * (-(z1 * z1 + z2 * z2) / 2.0).exp();
-                    if alpha >= 1.0 / 255.0 {
+                    if alpha >= splat_core::ALPHA_MIN {
                         visible[y / TILE * grid.columns + x / TILE] = true;
                     }
                 }

@@ -19,7 +19,8 @@ use super::pictures::{Pictures, Rows};
 use super::rows;
 use crate::cpu::buffer::overwritten;
 use crate::cpu::real::Real;
-use crate::ssim::{SsimArgs, counted};
+use crate::settings::SsimArgs;
+use crate::ssim::counted;
 
 /// Most pixels of a strip: its rings stay in a core's second-level cache.
 const STRIP: usize = 320;

@@ -1,13 +1,12 @@
 //! One Gaussian seen by one camera: the forward formulas, without a branch, so that a loop over Gaussians becomes SIMD
 //! code.
 
+use splat_core::SPLAT_SIZE_MAX;
+
 use super::super::math::*;
 use super::super::real::Real;
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::ProjectArgs;
-
-/// Splats larger than this many pixels are all alike: constant over any picture.
-const SIZE_MAX: f64 = 1e12;
 
 /// One camera, in the precision of the op.
 pub(super) struct Camera<T> {
@@ -88,7 +87,7 @@ pub(super) struct Splat<T> {
     pub(super) jwr: Mat23<T>,
     /// Unit of length of everything below but `packed`, in pixels.
     pub(super) k: T,
-    /// Larger than `SIZE_MAX`: its shape has no influence.
+    /// Larger than [`SPLAT_SIZE_MAX`]: its shape has no influence.
     pub(super) flat: bool,
     pub(super) v1: Vec3<T>,
     pub(super) v2: Vec3<T>,
@@ -140,8 +139,8 @@ impl<T: Real> Splat<T> {
         let largest_entry = largest(rows[0]).greatest(largest(rows[1]));
         let rows = [over(rows[0], largest_entry), over(rows[1], largest_entry)];
         let size = largest_entry * largest_scale;
-        let flat = size > T::of(SIZE_MAX);
-        let size = size.least(T::of(SIZE_MAX));
+        let flat = size > T::of(SPLAT_SIZE_MAX);
+        let size = size.least(T::of(SPLAT_SIZE_MAX));
 
         let k = size.greatest(camera.blur);
         let (share, blur) = (size / k, camera.blur / k);
@@ -174,6 +173,7 @@ impl<T: Real> Splat<T> {
             extent[0],
             extent[1],
         ];
+        // Strict, as `splat_core` says of culling.
         let reaches = (mean[0] + extent[0] > T::ZERO)
             & (mean[0] - extent[0] < camera.width)
             & (mean[1] + extent[1] > T::ZERO)

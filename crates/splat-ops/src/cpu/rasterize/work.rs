@@ -175,7 +175,7 @@ mod tests {
                 );
                 let (z1, z2) = (row[3] * dx, row[4] * dx + row[5] * dy);
                 let alpha = f64::from(*opacity) * (-(z1 * z1 + z2 * z2) / 2.0).exp();
-                seen += u64::from(alpha >= 1.0 / 255.0);
+                seen += u64::from(alpha >= splat_core::ALPHA_MIN);
             }
         }
         let count = |packed: Vec<f32>, opacities: Vec<f32>| {
