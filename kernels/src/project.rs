@@ -18,7 +18,9 @@
 //! gradients of cameras by blocks of Gaussians and then over the blocks, always in the same order: no atomics.
 
 use cubecl::prelude::*;
-use splat_core::{ImageSize, PROJECTED_DEPTH, PROJECTED_WIDTH, ProjectSettings, SPLAT_SIZE_MAX};
+use splat_core::{
+    ImageSize, PROJECTED_DEPTH, PROJECTED_WIDTH, ProjectSettings, ProjectTensors, SPLAT_SIZE_MAX,
+};
 
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
@@ -59,32 +61,17 @@ fn uniforms(size: ImageSize, settings: &ProjectSettings) -> UniformsLaunch {
     )
 }
 
-/// The tensors that the projection reads: means [N, 3], quats [N, 4], scales [N, 3], viewmats [C, 4, 4],
-/// intrinsics [C, 4].
-#[derive(Clone, Debug)]
-pub struct ProjectInputs {
-    /// World positions [N, 3].
-    pub means: Buffer,
-    /// Quaternions (w, x, y, z), any non-zero length [N, 4].
-    pub quats: Buffer,
-    /// Linear scales [N, 3].
-    pub scales: Buffer,
-    /// World-to-camera matrices, row-major [C, 4, 4].
-    pub viewmats: Buffer,
-    /// fx, fy, cx, cy in pixels [C, 4].
-    pub intrinsics: Buffer,
+/// The inputs of the projection.
+pub type ProjectInputs = ProjectTensors<Buffer>;
+
+fn gaussians(inputs: &ProjectInputs) -> usize {
+    (inputs.means.len() / 3)
+        .min(inputs.quats.len() / 4)
+        .min(inputs.scales.len() / 3)
 }
 
-impl ProjectInputs {
-    fn gaussians(&self) -> usize {
-        (self.means.len() / 3)
-            .min(self.quats.len() / 4)
-            .min(self.scales.len() / 3)
-    }
-
-    fn cameras(&self) -> usize {
-        (self.viewmats.len() / 16).min(self.intrinsics.len() / 4)
-    }
+fn cameras(inputs: &ProjectInputs) -> usize {
+    (inputs.viewmats.len() / 16).min(inputs.intrinsics.len() / 4)
 }
 
 /// A Gaussian as stored.
@@ -357,7 +344,7 @@ pub fn project(
     size: ImageSize,
     settings: &ProjectSettings,
 ) -> Buffer {
-    let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
+    let (gaussians, cameras) = (gaussians(inputs), cameras(inputs));
     let packed = Buffer::empty(client, cameras * gaussians * PROJECTED_WIDTH);
     if let Some((count, dim)) = per_element(cameras * gaussians) {
         project_forward::launch(
@@ -520,7 +507,7 @@ fn project_backward_gaussians(
     gaussians: u32,
     cameras: u32,
     s: Uniforms,
-    #[comptime] wanted: [bool; 3],
+    #[comptime] needs_grad: ProjectTensors<bool>,
 ) {
     let gaussians = gaussians as usize;
     let index = ABSOLUTE_POS;
@@ -554,13 +541,13 @@ fn project_backward_gaussians(
                 scale_z += grad.scale.z;
             }
         }
-        if comptime!(wanted[0]) {
+        if comptime!(needs_grad.means) {
             Vec3::new(mean_x, mean_y, mean_z).store(grad_means, index * 3);
         }
-        if comptime!(wanted[1]) {
+        if comptime!(needs_grad.quats) {
             Quat::new(quat_w, quat_x, quat_y, quat_z).store(grad_quats, index * 4);
         }
-        if comptime!(wanted[2]) {
+        if comptime!(needs_grad.scales) {
             Vec3::new(scale_x, scale_y, scale_z).store(grad_scales, index * 3);
         }
     }
@@ -653,7 +640,7 @@ fn sum_camera_partials(
     grad_intrinsics: &mut [f32],
     cameras: u32,
     blocks: u32,
-    #[comptime] wanted: [bool; 2],
+    #[comptime] needs_grad: ProjectTensors<bool>,
 ) {
     let c = ABSOLUTE_POS / CAMERA_VALUES;
     let k = ABSOLUTE_POS % CAMERA_VALUES;
@@ -663,14 +650,14 @@ fn sum_camera_partials(
             sum += partials[(c * blocks as usize + block) * CAMERA_VALUES + k];
         }
         if k < 12 {
-            if comptime!(wanted[0]) {
+            if comptime!(needs_grad.viewmats) {
                 grad_viewmats[c * 16 + k] = sum;
             }
         } else {
-            if comptime!(wanted[0]) {
+            if comptime!(needs_grad.viewmats) {
                 grad_viewmats[c * 16 + k] = 0.0f32;
             }
-            if comptime!(wanted[1]) {
+            if comptime!(needs_grad.intrinsics) {
                 grad_intrinsics[c * 4 + k - 12] = sum;
             }
         }
@@ -678,28 +665,29 @@ fn sum_camera_partials(
 }
 
 /// Gradients of means [N, 3], quats [N, 4], scales [N, 3], viewmats [C, 4, 4] and intrinsics [C, 4] for the gradient
-/// of the packed splats [C, N, 9]; only those `wanted`.
+/// of the packed splats [C, N, 9]; only those that `needs_grad` names.
 pub fn project_backward(
     client: &Client,
     inputs: &ProjectInputs,
     grad_packed: &Buffer,
     size: ImageSize,
     settings: &ProjectSettings,
-    wanted: [bool; 5],
-) -> [Option<Buffer>; 5] {
-    let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
-    let lens = [
-        gaussians * 3,
-        gaussians * 4,
-        gaussians * 3,
-        cameras * 16,
-        cameras * 4,
-    ];
-    // An unwanted gradient still needs something to bind.
-    let grads: [Buffer; 5] =
-        std::array::from_fn(|i| Buffer::empty(client, if wanted[i] { lens[i] } else { 1 }));
+    needs_grad: ProjectTensors<bool>,
+) -> ProjectTensors<Option<Buffer>> {
+    let (gaussians, cameras) = (gaussians(inputs), cameras(inputs));
+    let lens = ProjectTensors {
+        means: gaussians * 3,
+        quats: gaussians * 4,
+        scales: gaussians * 3,
+        viewmats: cameras * 16,
+        intrinsics: cameras * 4,
+    };
+    // A gradient that is not needed still needs something to bind.
+    let grads = lens
+        .zip(needs_grad)
+        .map(|(len, needed)| Buffer::empty(client, if needed { len } else { 1 }));
 
-    if wanted[..3].contains(&true)
+    if (needs_grad.means || needs_grad.quats || needs_grad.scales)
         && let Some((count, dim)) = per_element(gaussians)
     {
         project_backward_gaussians::launch(
@@ -712,16 +700,16 @@ pub fn project_backward(
             inputs.viewmats.arg(),
             inputs.intrinsics.arg(),
             grad_packed.arg(),
-            grads[0].arg(),
-            grads[1].arg(),
-            grads[2].arg(),
+            grads.means.arg(),
+            grads.quats.arg(),
+            grads.scales.arg(),
             gaussians as u32,
             cameras as u32,
             uniforms(size, settings),
-            [wanted[0], wanted[1], wanted[2]],
+            needs_grad,
         );
     }
-    if wanted[3..].contains(&true) && cameras > 0 {
+    if (needs_grad.viewmats || needs_grad.intrinsics) && cameras > 0 {
         let blocks = gaussians.div_ceil(CAMERA_BLOCK);
         let partials = Buffer::empty(client, cameras * blocks * CAMERA_VALUES);
         if blocks > 0 {
@@ -748,19 +736,15 @@ pub fn project_backward(
                 count,
                 dim,
                 partials.arg(),
-                grads[3].arg(),
-                grads[4].arg(),
+                grads.viewmats.arg(),
+                grads.intrinsics.arg(),
                 cameras as u32,
                 blocks as u32,
-                [wanted[3], wanted[4]],
+                needs_grad,
             );
         }
     }
-    let mut grads = grads.map(Some);
-    for (grad, wanted) in grads.iter_mut().zip(wanted) {
-        if !wanted {
-            *grad = None;
-        }
-    }
     grads
+        .zip(needs_grad)
+        .map(|(grad, needed)| needed.then_some(grad))
 }

@@ -25,7 +25,7 @@ mod sums;
 mod tile;
 
 use cubecl::prelude::*;
-use splat_core::PROJECTED_WIDTH;
+use splat_core::{PROJECTED_WIDTH, RasterizeTensors};
 
 use self::background::background_gradient;
 use self::backward::{SHAPE_GRADIENTS, SlotLayout, rasterize_backward};
@@ -342,7 +342,7 @@ fn zeros(client: &Client, len: usize) -> Buffer {
 }
 
 /// Gradients of packed splats [C, N, 9], colours [C, N, D], opacities [C, N] and background [C, D] for the gradient of
-/// the output [C, H, W, D + 1]; only those `wanted`. In order if `state` has slots.
+/// the output [C, H, W, D + 1]; only those that `needs_grad` names. In order if `state` has slots.
 pub fn rasterize_vjp(
     client: &Client,
     inputs: &RasterizeInputs,
@@ -350,17 +350,11 @@ pub fn rasterize_vjp(
     grad_output: &Buffer,
     frames: &Frames,
     settings: &RasterizeSettings,
-    wanted: [bool; 4],
-) -> [Option<Buffer>; 4] {
+    needs_grad: RasterizeTensors<bool>,
+) -> RasterizeTensors<Option<Buffer>> {
     let splats = frames.splats();
     let channels = inputs.channels;
-    let [
-        wants_packed,
-        wants_colors,
-        wants_opacities,
-        wants_background,
-    ] = wanted;
-    let shape = wants_packed || wants_opacities;
+    let shape = needs_grad.packed || needs_grad.opacities;
     let lists = &state.lists;
     let sums = match lists.slots {
         Some(_) => Sums::Ordered,
@@ -374,11 +368,11 @@ pub fn rasterize_vjp(
     };
     let gradients = [
         reserve(shape, splats * PROJECTED_WIDTH),
-        reserve(wants_colors, splats * channels),
+        reserve(needs_grad.colors, splats * channels),
         reserve(shape, splats),
     ];
 
-    if shape || wants_colors {
+    if shape || needs_grad.colors {
         let plan = Plan::new(client);
         let page = client.properties().memory.max_page_size;
         let width = match sums {
@@ -388,7 +382,7 @@ pub fn rasterize_vjp(
         for first_channel in (0..channels).step_by(width) {
             let layout = SlotLayout {
                 shape,
-                colors: wants_colors,
+                colors: needs_grad.colors,
                 width: width.min(channels - first_channel),
             };
             let launch = Launch {
@@ -410,13 +404,13 @@ pub fn rasterize_vjp(
         }
     }
     let [grad_packed, grad_colors, grad_opacities] = gradients;
-    [
-        wants_packed.then_some(grad_packed),
-        wants_colors.then_some(grad_colors),
-        wants_opacities.then_some(grad_opacities),
-        (wants_background && inputs.background.is_some())
+    RasterizeTensors {
+        packed: needs_grad.packed.then_some(grad_packed),
+        colors: needs_grad.colors.then_some(grad_colors),
+        opacities: needs_grad.opacities.then_some(grad_opacities),
+        background: (needs_grad.background && inputs.background.is_some())
             .then(|| background_gradient(client, state, grad_output, channels, frames)),
-    ]
+    }
 }
 
 /// Some channels of the backward pass, as many as a launch can do.

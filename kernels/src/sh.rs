@@ -286,7 +286,7 @@ fn sh_backward_dirs(
 }
 
 /// Gradients of the coefficients [N, `stored`, 3] and directions [C, N, 3] for that of the colours [C, N, 3]; only
-/// those `wanted`.
+/// those that `needs_grad` names.
 pub fn evaluate_backward(
     client: &Client,
     coefficients: &Buffer,
@@ -294,10 +294,10 @@ pub fn evaluate_backward(
     grad_colors: &Buffer,
     stored: usize,
     degree: usize,
-    wanted: [bool; 2],
+    needs_grad: [bool; 2],
 ) -> [Option<Buffer>; 2] {
     let (gaussians, cameras, degree) = sizes(coefficients, dirs, stored, degree);
-    let grad_coefficients = wanted[0].then(|| {
+    let grad_coefficients = needs_grad[0].then(|| {
         let grad = Buffer::empty(client, coefficients.len());
         if let Some((count, dim)) = per_element(gaussians) {
             sh_backward_coefficients::launch(
@@ -315,7 +315,7 @@ pub fn evaluate_backward(
         }
         grad
     });
-    let grad_dirs = wanted[1].then(|| {
+    let grad_dirs = needs_grad[1].then(|| {
         let grad = Buffer::empty(client, dirs.len());
         if let Some((count, dim)) = per_element(cameras * gaussians) {
             sh_backward_dirs::launch(

@@ -17,7 +17,8 @@
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 use splat_core::{
-    ClampGradient, PROJECTED_EXTENT, PROJECTED_WIDTH, ShColorSettings, sh_coefficient_count,
+    ClampGradient, PROJECTED_EXTENT, PROJECTED_WIDTH, ShColorSettings, ShColorTensors,
+    sh_coefficient_count,
 };
 
 use crate::floor::{Bytes, Sizes};
@@ -69,7 +70,7 @@ impl ShRest {
 
 /// What the colours are made of.
 #[derive(Clone, Debug)]
-pub struct ShInputs {
+pub struct ShColorInputs {
     /// Coefficients of degree 0 [N, 1, 3].
     pub sh0: Buffer,
     /// Those of the higher degrees [N, R, 3], if there are any.
@@ -84,7 +85,7 @@ pub struct ShInputs {
     pub seen: Option<Buffer>,
 }
 
-impl ShInputs {
+impl ShColorInputs {
     fn gaussians(&self) -> usize {
         let rest = self.sh_rest.as_ref().filter(|_| self.stored > 0);
         (self.means.len() / 3)
@@ -220,7 +221,7 @@ fn sh_colors_forward<R: Float>(
 }
 
 /// Colours [C, N, 3]. The degree is cut to [`SH_DEGREE_MAX`](splat_core::SH_DEGREE_MAX) and to what is stored.
-pub fn sh_colors(client: &Client, inputs: &ShInputs, settings: ShColorSettings) -> Buffer {
+pub fn sh_colors(client: &Client, inputs: &ShColorInputs, settings: ShColorSettings) -> Buffer {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
     let colors = Buffer::empty(client, cameras * gaussians * 3);
     let (rest, stored_as) = inputs.rest();
@@ -304,7 +305,7 @@ fn sh_colors_backward_gaussians<R: Float>(
     cameras: u32,
     stored: u32,
     #[comptime] degree: usize,
-    #[comptime] wanted: [bool; 3],
+    #[comptime] needs_grad: ShColorTensors<bool>,
     #[comptime] asked: bool,
     #[comptime] recovers: bool,
     #[define(R)] _stored_as: ElemType,
@@ -331,7 +332,7 @@ fn sh_colors_backward_gaussians<R: Float>(
                 basis(sight.unit, &mut y, degree);
                 let color = unclamped::<R>(sh0, rest, &y, gaussian, stored, degree);
                 let g = passed_on(color, g, recovers);
-                if comptime!(wanted[0] || wanted[1]) {
+                if comptime!(needs_grad.sh0 || needs_grad.sh_rest) {
                     #[unroll]
                     for k in 0..comptime!(sh_coefficient_count(degree)) {
                         sums[k * 3] += y[k] * g.x;
@@ -339,7 +340,7 @@ fn sh_colors_backward_gaussians<R: Float>(
                         sums[k * 3 + 2] += y[k] * g.z;
                     }
                 }
-                if comptime!(wanted[2]) {
+                if comptime!(needs_grad.means) {
                     let grad = sight_vjp::<R>(rest, sight, g, gaussian, stored, degree);
                     mean_x += grad.x;
                     mean_y += grad.y;
@@ -347,10 +348,10 @@ fn sh_colors_backward_gaussians<R: Float>(
                 }
             }
         }
-        if comptime!(wanted[0]) {
+        if comptime!(needs_grad.sh0) {
             Vec3::new(sums[0], sums[1], sums[2]).store(grad_sh0, gaussian * 3);
         }
-        if comptime!(wanted[1]) {
+        if comptime!(needs_grad.sh_rest) {
             let to = gaussian * stored * 3;
             #[unroll]
             for k in 3..comptime!(3 * sh_coefficient_count(degree)) {
@@ -360,7 +361,7 @@ fn sh_colors_backward_gaussians<R: Float>(
                 grad_rest[to + k] = 0.0f32;
             }
         }
-        if comptime!(wanted[2]) {
+        if comptime!(needs_grad.means) {
             Vec3::new(mean_x, mean_y, mean_z).store(grad_means, gaussian * 3);
         }
     }
@@ -423,22 +424,23 @@ fn sh_colors_backward_centers<R: Float>(
 }
 
 /// Gradients of sh0 [N, 1, 3], `sh_rest` [N, R, 3], means [N, 3] and centres [C, 3] for that of the colours [C, N, 3];
-/// only those `wanted`.
+/// only those that `needs_grad` names.
 pub fn sh_colors_backward(
     client: &Client,
-    inputs: &ShInputs,
+    inputs: &ShColorInputs,
     grad_colors: &Buffer,
     settings: ShColorSettings,
-    wanted: [bool; 4],
-) -> [Option<Buffer>; 4] {
+    needs_grad: ShColorTensors<bool>,
+) -> ShColorTensors<Option<Buffer>> {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
     let degree = inputs.degree(settings.degree);
     let recovers = settings.clamp_gradient == ClampGradient::Recovering;
-    let lens = [gaussians * 3, gaussians * inputs.stored * 3, gaussians * 3];
-    // An unwanted gradient still needs something to bind.
-    let grads: [Buffer; 3] =
-        std::array::from_fn(|i| Buffer::empty(client, if wanted[i] { lens[i] } else { 1 }));
-    if wanted[..3].contains(&true)
+    // A gradient that is not needed still needs something to bind.
+    let reserve = |needed, len| Buffer::empty(client, if needed { len } else { 1 });
+    let sh0 = reserve(needs_grad.sh0, gaussians * 3);
+    let sh_rest = reserve(needs_grad.sh_rest, gaussians * inputs.stored * 3);
+    let means = reserve(needs_grad.means, gaussians * 3);
+    if (needs_grad.sh0 || needs_grad.sh_rest || needs_grad.means)
         && let Some((count, dim)) = per_element(gaussians)
     {
         let (rest, stored_as) = inputs.rest();
@@ -453,20 +455,20 @@ pub fn sh_colors_backward(
             inputs.centers.arg(),
             packed,
             grad_colors.arg(),
-            grads[0].arg(),
-            grads[1].arg(),
-            grads[2].arg(),
+            sh0.arg(),
+            sh_rest.arg(),
+            means.arg(),
             gaussians as u32,
             cameras as u32,
             inputs.stored as u32,
             degree,
-            [wanted[0], wanted[1], wanted[2]],
+            needs_grad,
             asked,
             recovers,
             stored_as,
         );
     }
-    let of_centers = wanted[3].then(|| {
+    let centers = needs_grad.centers.then(|| {
         let blocks = gaussians.div_ceil(CENTER_BLOCK);
         let partials = Buffer::empty(client, cameras * blocks * 3);
         if !partials.is_empty() {
@@ -495,11 +497,11 @@ pub fn sh_colors_backward(
         }
         sum_blocks(client, &partials, [cameras, blocks, 3])
     });
-    let [sh0, sh_rest, means] = grads;
-    [
-        wanted[0].then_some(sh0),
-        wanted[1].then_some(sh_rest),
-        wanted[2].then_some(means),
-        of_centers,
-    ]
+    ShColorTensors {
+        sh0: needs_grad.sh0.then_some(sh0),
+        sh_rest: needs_grad.sh_rest.then_some(sh_rest),
+        means: needs_grad.means.then_some(means),
+        centers,
+        seen: None,
+    }
 }

@@ -461,7 +461,7 @@ pub fn ssim(
     (map, moments)
 }
 
-/// Gradients of both images for the gradient `grad` of S [B, H, W, D]; only those `wanted`.
+/// Gradients of both images for the gradient `grad` of S [B, H, W, D]; only those that `needs_grad` names.
 pub fn ssim_vjp(
     client: &Client,
     images: [&Buffer; 2],
@@ -469,7 +469,7 @@ pub fn ssim_vjp(
     grad: &Buffer,
     shape: &SsimShape,
     window: &[f32],
-    wanted: [bool; 2],
+    needs_grad: [bool; 2],
 ) -> [Option<Buffer>; 2] {
     let len = shape.len();
     let weights = Buffer::from_f32(client, window);
@@ -512,5 +512,5 @@ pub fn ssim_vjp(
         }
         out
     };
-    [0, 1].map(|own| wanted[own].then(|| gradient(own)))
+    [0, 1].map(|own| needs_grad[own].then(|| gradient(own)))
 }

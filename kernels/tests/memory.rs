@@ -64,8 +64,10 @@ fn a_picture_keeps_the_bytes_that_are_stated() {
             assert!((stated..stated + 4096).contains(&used));
 
             let before = work().reserved_bytes;
-            let wanted = [true, true, true, false];
-            rasterize_vjp(&client, &inputs, &state, &image, &frames, &settings, wanted);
+            let needs_grad = [true, true, true, false].into();
+            rasterize_vjp(
+                &client, &inputs, &state, &image, &frames, &settings, needs_grad,
+            );
             let reserved = work().reserved_bytes - before;
             // Gradients of nine floats of a packed splat, one colour and the opacity; and what stands for a missing input.
             let stated = 44 * splats as u64

@@ -6,6 +6,7 @@ pub mod memory;
 mod packed;
 mod settings;
 mod sh;
+mod tensors;
 
 pub use packed::{PROJECTED_DEPTH, PROJECTED_EXTENT, PROJECTED_WIDTH, SPLAT_SIZE_MAX, TILE_SIDE};
 pub use settings::{
@@ -13,3 +14,7 @@ pub use settings::{
     RasterizeSettings, ShColorSettings, SsimArgs,
 };
 pub use sh::{SH_C0, SH_C1, SH_C2, SH_C3, SH_DEGREE_MAX, sh_coefficient_count};
+pub use tensors::{
+    AdamTensors, ProjectTensors, RasterizeTensors, ScreenStatisticsTensors, ShColorTensors,
+    SphericalHarmonicsTensors, SsimTensors,
+};

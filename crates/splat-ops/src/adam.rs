@@ -2,9 +2,10 @@
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
+use tracing::trace_span;
 
 use crate::OpError;
-use crate::backend::SplatOps;
+use crate::backend::{AdamOps, AdamTensors, OpInputs};
 use crate::check::Checker;
 use crate::settings::AdamStep;
 
@@ -32,13 +33,14 @@ pub fn adam_step<const D: usize>(
     ] {
         check.tensor(name, other, param.dims().map(Some), "that of `param`")?;
     }
-    let stepped = <Dispatch as SplatOps>::adam(
-        param.into_dispatch(),
-        grad.into_dispatch(),
-        moment_1.into_dispatch(),
-        moment_2.into_dispatch(),
-        *step,
-    );
+    let inputs = OpInputs(AdamTensors {
+        param: param.into_dispatch(),
+        grad: grad.into_dispatch(),
+        moment_1: moment_1.into_dispatch(),
+        moment_2: moment_2.into_dispatch(),
+    });
+    let _span = trace_span!("adam").entered();
+    let stepped = Dispatch::adam(inputs, *step);
     Ok((
         Tensor::from_dispatch(stepped.param),
         [stepped.moment_1, stepped.moment_2].map(Tensor::from_dispatch),

@@ -2,9 +2,10 @@
 
 use burn::backend::Dispatch;
 use burn::tensor::{Int, Tensor};
+use tracing::trace_span;
 
 use crate::OpError;
-use crate::backend::{self, SplatOps};
+use crate::backend::{self, PhotometricOps};
 use crate::check::Checker;
 use crate::settings::SsimArgs;
 
@@ -96,8 +97,8 @@ pub fn photometric(
             backend::Target::Values(values.into_dispatch())
         }
     };
-    let losses =
-        <Dispatch as SplatOps>::photometric(rendered.into_dispatch(), target, args.clone());
+    let _span = trace_span!("photometric").entered();
+    let losses = Dispatch::photometric(rendered.into_dispatch(), target, args.clone());
     Ok(Photometric {
         losses: Tensor::from_dispatch(losses),
     })

@@ -4,8 +4,9 @@ use std::sync::OnceLock;
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
+use tracing::trace_span;
 
-use crate::backend::{Optional, SplatOps};
+use crate::backend::{OpInputs, RasterizeOps, RasterizeTensors};
 use crate::check::Checker;
 use crate::settings::RasterizeArgs;
 use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
@@ -78,21 +79,21 @@ pub fn rasterize<const DC: usize, const DO: usize>(
     }
 
     let errors = ErrorSlot::default();
-    let packed = <Dispatch as SplatOps>::rasterize(
-        packed.into_dispatch(),
-        colors.into_dispatch(),
-        opacities.into_dispatch(),
-        match background {
-            Some(color) => Optional::Some(color.into_dispatch()),
-            None => Optional::None,
-        },
-        RasterizeArgs {
-            size: projected.image_size(),
-            settings: *settings,
-            backward: false,
-            errors: errors.clone(),
-        },
-    );
+    let inputs = OpInputs(RasterizeTensors {
+        packed: packed.into_dispatch(),
+        colors: colors.into_dispatch(),
+        opacities: opacities.into_dispatch(),
+        background: background.map(Tensor::into_dispatch),
+    });
+    let args = RasterizeArgs {
+        size: projected.image_size(),
+        settings: *settings,
+        backward: false,
+        errors: errors.clone(),
+    };
+    let span = trace_span!("rasterize").entered();
+    let packed = Dispatch::rasterize(inputs, args);
+    drop(span);
     if let Some(error) = errors.error() {
         return Err(error.clone());
     }

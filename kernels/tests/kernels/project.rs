@@ -100,14 +100,15 @@ fn projection_and_all_its_gradients_agree_with_float64() {
         row[7] = 0.0;
         row[8] = 0.0;
     }
-    let grads = project_backward(
+    let grads: [_; 5] = project_backward(
         &client,
         &inputs,
         &upload(&client, &weights),
         SIZE,
         &settings(),
-        [true; 5],
-    );
+        [true; 5].into(),
+    )
+    .into();
     let weights = wide(&weights);
     let names = ["means", "quats", "scales", "viewmats", "intrinsics"];
     for (which, grad) in grads.iter().enumerate() {
@@ -131,13 +132,15 @@ fn only_the_wanted_gradients_are_returned() {
     let scene = scene(10);
     let inputs = inputs(&client, &scene);
     let grad = upload(&client, &[1.0; 2 * 10 * 9]);
-    let all = project_backward(&client, &inputs, &grad, SIZE, &settings(), [true; 5]);
+    let all: [_; 5] =
+        project_backward(&client, &inputs, &grad, SIZE, &settings(), [true; 5].into()).into();
     for wanted in [
         [true, false, false, false, false],
         [false, true, true, false, true],
         [false, false, false, true, false],
     ] {
-        let some = project_backward(&client, &inputs, &grad, SIZE, &settings(), wanted);
+        let some: [_; 5] =
+            project_backward(&client, &inputs, &grad, SIZE, &settings(), wanted.into()).into();
         for i in 0..5 {
             assert_eq!(some[i].is_some(), wanted[i]);
             if let (Some(some), Some(all)) = (&some[i], &all[i]) {
@@ -185,7 +188,8 @@ fn bad_gaussians_are_culled_and_their_gradients_are_zero() {
         assert_eq!(row, [0.0; 9], "{}", case.0);
     }
     let grad = upload(&client, &vec![1.0; packed.len()]);
-    for grad in project_backward(&client, &inputs, &grad, SIZE, &settings(), [true; 5]) {
+    let grads = project_backward(&client, &inputs, &grad, SIZE, &settings(), [true; 5].into());
+    for grad in <[_; 5]>::from(grads) {
         assert!(download(&client, &grad.unwrap()).iter().all(|v| *v == 0.0));
     }
 }
@@ -214,14 +218,15 @@ fn the_length_of_a_quaternion_does_not_matter() {
     }
     // The gradient is orthogonal to the quaternion.
     let grad = upload(&client, &uniform(&mut rng(8), packed.len(), -1.0, 1.0));
-    let [_, grad, ..] = project_backward(
+    let [_, grad, ..]: [_; 5] = project_backward(
         &client,
         &inputs,
         &grad,
         SIZE,
         &settings(),
-        [false, true, false, false, false],
-    );
+        [false, true, false, false, false].into(),
+    )
+    .into();
     for (q, g) in wide(&scene[1])
         .chunks(4)
         .zip(wide(&download(&client, &grad.unwrap())).chunks(4))
@@ -270,14 +275,15 @@ fn no_gaussians_project_to_nothing() {
     let scene = [vec![], vec![], vec![], viewmats, intrinsics];
     let inputs = inputs(&client, &scene);
     assert!(project(&client, &inputs, SIZE, &settings()).is_empty());
-    let grads = project_backward(
+    let grads: [_; 5] = project_backward(
         &client,
         &inputs,
         &upload(&client, &[]),
         SIZE,
         &settings(),
-        [true; 5],
-    );
+        [true; 5].into(),
+    )
+    .into();
     let grads = grads.map(|grad| download(&client, &grad.unwrap()));
     assert!(grads[..3].iter().all(Vec::is_empty));
     assert_eq!(grads[3], [0.0; 32]);

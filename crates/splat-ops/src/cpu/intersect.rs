@@ -387,7 +387,7 @@ mod tests {
     use core::cell::Cell;
 
     use super::*;
-    use crate::backend::SplatBackend;
+    use crate::backend::{OpInputs, RasterizeBackend, RasterizeTensors};
     use crate::cpu::buffer::tensor;
     use crate::{ImageSize, ProjectSettings, Projected, RasterizeSettings, project, rasterize};
     use burn::backend::Flex;
@@ -528,26 +528,21 @@ mod tests {
     fn an_image_that_was_not_rendered_is_zero_and_so_are_its_gradients() {
         let args = small_picture();
         let row = vec![1.0f32, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 3.0, 3.0];
-        let inputs = || {
-            (
-                tensor(row.clone(), [1, 1, PROJECTED_WIDTH]),
-                tensor(vec![1.0f32], [1, 1, 1]),
-                tensor(vec![0.5f32], [1, 1]),
-                Some(tensor(vec![1.0f32], [1, 1])),
-            )
-        };
+        let inputs = OpInputs(RasterizeTensors {
+            packed: tensor(row, [1, 1, PROJECTED_WIDTH]),
+            colors: tensor(vec![1.0f32], [1, 1, 1]),
+            opacities: tensor(vec![0.5f32], [1, 1]),
+            background: Some(tensor(vec![1.0f32], [1, 1])),
+        });
         LIMIT.set(0);
-        let (packed, colors, opacities, background) = inputs();
-        let (image, state) = Flex::rasterize_forward(packed, colors, opacities, background, &args);
+        let (image, state) = Flex::rasterize_tracked(inputs.clone(), &args);
         LIMIT.set(MAX_PAIRS);
         assert!(args.errors.error().is_some());
         assert_eq!(image.as_slice::<f32>(), Some(&[0.0; 12][..]));
 
-        let (packed, colors, opacities, background) = inputs();
         let grad = tensor(vec![1.0f32; 12], [1, 2, 3, 2]);
-        let grads = Flex::rasterize_backward(
-            packed, colors, opacities, background, image, state, grad, &args, [true; 4],
-        );
+        let grads = Flex::rasterize_backward(inputs, state, grad, &args, [true; 4].into());
+        let grads: [_; 4] = grads.into();
         for (grad, length) in grads.iter().zip([PROJECTED_WIDTH, 1, 1, 1]) {
             let grad = grad.as_ref().and_then(|grad| grad.as_slice::<f32>());
             assert_eq!(grad, Some(&vec![0.0; length][..]));

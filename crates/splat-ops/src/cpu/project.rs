@@ -22,6 +22,7 @@ mod splat;
 use core::marker::PhantomData;
 use core::ops::Range;
 
+use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
@@ -31,7 +32,10 @@ use super::buffer::{Buffer, tensor};
 use super::parts::Uncleared;
 use super::real::Real;
 use super::simd::{LANES, Lanes, for_each_block, vectorized};
-use crate::backend::PROJECTED_WIDTH;
+use crate::backend::{
+    OpInputs, PROJECTED_WIDTH, ProjectBackend, ProjectGradients, ProjectInputs, ProjectOps,
+    ProjectTensors,
+};
 use crate::settings::ProjectArgs;
 
 /// Gaussians per unit of parallel work. Fixed, so that sums over Gaussians have a fixed order.
@@ -52,13 +56,13 @@ struct Inputs<'a, T> {
 }
 
 impl<'a, T: Real> Inputs<'a, T> {
-    fn new(buffers: &'a [Buffer; 5], args: &ProjectArgs) -> Self {
-        let [means, quats, scales, viewmats, intrinsics] =
-            buffers.each_ref().map(|buffer| buffer.slice::<T>());
+    fn new(buffers: &'a ProjectTensors<Buffer>, args: &ProjectArgs) -> Self {
+        let viewmats = buffers.viewmats.slice::<T>();
+        let intrinsics = buffers.intrinsics.slice::<T>();
         Self {
-            means,
-            quats,
-            scales,
+            means: buffers.means.slice(),
+            quats: buffers.quats.slice(),
+            scales: buffers.scales.slice(),
             cameras: viewmats
                 .chunks_exact(16)
                 .zip(intrinsics.chunks_exact(4))
@@ -119,9 +123,33 @@ vectorized! {
     }
 }
 
-pub(super) fn forward<T: Real>(
+impl ProjectOps for Flex {
+    fn project(OpInputs(inputs): ProjectInputs<Self>, args: ProjectArgs) -> FlexTensor {
+        in_precision!(inputs.means, forward, inputs, &args)
+    }
+}
+
+impl ProjectBackend for Flex {
+    fn project_backward(
+        OpInputs(inputs): ProjectInputs<Self>,
+        grad_packed: FlexTensor,
+        args: &ProjectArgs,
+        needs_grad: ProjectTensors<bool>,
+    ) -> ProjectGradients<Self> {
+        in_precision!(
+            inputs.means,
+            backward,
+            inputs,
+            grad_packed,
+            args,
+            needs_grad
+        )
+    }
+}
+
+fn forward<T: Real>(
     _: PhantomData<T>,
-    inputs: [FlexTensor; 5],
+    inputs: ProjectTensors<FlexTensor>,
     args: &ProjectArgs,
 ) -> FlexTensor {
     let buffers = inputs.map(Buffer::new);
@@ -264,13 +292,13 @@ impl<T: Real> Chunk<'_, T> {
     }
 }
 
-pub(super) fn backward<T: Real>(
+fn backward<T: Real>(
     _: PhantomData<T>,
-    inputs: [FlexTensor; 5],
+    inputs: ProjectTensors<FlexTensor>,
     grad_packed: FlexTensor,
     args: &ProjectArgs,
-    wanted: [bool; 5],
-) -> [Option<FlexTensor>; 5] {
+    needs_grad: ProjectTensors<bool>,
+) -> ProjectGradients<Flex> {
     let buffers = inputs.map(Buffer::new);
     let inputs = Inputs::<T>::new(&buffers, args);
     let grad = Buffer::new(grad_packed);
@@ -290,7 +318,7 @@ pub(super) fn backward<T: Real>(
                 means: means.cleared(),
                 quats: quats.cleared(),
                 scales: scales.cleared(),
-                of_cameras: wanted[3] || wanted[4],
+                of_cameras: needs_grad.viewmats || needs_grad.intrinsics,
             };
             let views = inputs
                 .cameras
@@ -311,16 +339,18 @@ pub(super) fn backward<T: Real>(
         }
     }
     let [means, quats, scales] = [means, quats, scales].map(Uncleared::written);
-    [
-        wanted[0].then(|| tensor(means, [n, 3])),
-        wanted[1].then(|| tensor(quats, [n, 4])),
-        wanted[2].then(|| tensor(scales, [n, 3])),
-        wanted[3].then(|| tensor(viewmat_gradients(&cameras), [c, 4, 4])),
-        wanted[4].then(|| {
+    ProjectTensors {
+        means: needs_grad.means.then(|| tensor(means, [n, 3])),
+        quats: needs_grad.quats.then(|| tensor(quats, [n, 4])),
+        scales: needs_grad.scales.then(|| tensor(scales, [n, 3])),
+        viewmats: needs_grad
+            .viewmats
+            .then(|| tensor(viewmat_gradients(&cameras), [c, 4, 4])),
+        intrinsics: needs_grad.intrinsics.then(|| {
             let values = cameras.iter().flat_map(|camera| &camera[12..]).copied();
             tensor(values.collect(), [c, 4])
         }),
-    ]
+    }
 }
 
 fn viewmat_gradients<T: Real>(cameras: &[[T; CAMERA]]) -> Vec<T> {

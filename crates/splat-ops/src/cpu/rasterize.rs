@@ -24,6 +24,7 @@ use core::any::Any;
 use core::marker::PhantomData;
 use std::sync::Arc;
 
+use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use macerator::{Arch, Simd, Vector, WithSimd};
 use rayon::prelude::*;
@@ -39,7 +40,10 @@ use super::real::Real;
 use super::schedule::heaviest_first;
 use super::simd::prefetch;
 use crate::OpError;
-use crate::backend::PROJECTED_WIDTH;
+use crate::backend::{
+    OpInputs, PROJECTED_WIDTH, RasterizeBackend, RasterizeGradients, RasterizeInputs, RasterizeOps,
+    RasterizeTensors,
+};
 use crate::settings::RasterizeArgs;
 use batch::by_groups;
 use blend::BlendTile;
@@ -205,52 +209,67 @@ struct Camera<'a, T> {
     channels: usize,
 }
 
-/// The tensors of one call, split by camera.
-struct Inputs {
-    packed: Buffer,
-    colors: Buffer,
-    opacities: Buffer,
-    background: Option<Buffer>,
-}
+/// The tensors of one call.
+type Buffers = RasterizeTensors<Buffer, Option<Buffer>>;
 
-impl Inputs {
-    fn new([packed, colors, opacities]: [FlexTensor; 3], background: Option<FlexTensor>) -> Self {
-        Self {
-            packed: Buffer::new(packed),
-            colors: Buffer::new(colors),
-            opacities: Buffer::new(opacities),
-            background: background.map(Buffer::new),
-        }
-    }
-
-    /// C, N, D.
-    fn dims(&self) -> [usize; 3] {
-        self.colors.dims()
-    }
-
-    fn camera<T: Real>(&self, index: usize) -> Camera<'_, T> {
-        let [_, n, d] = self.dims();
+impl<'a, T: Real> Camera<'a, T> {
+    fn new(buffers: &'a Buffers, index: usize) -> Self {
+        let [_, n, d] = buffers.colors.dims();
         fn part<T: Real>(buffer: &Buffer, index: usize, length: usize) -> &[T] {
             &buffer.slice()[index * length..(index + 1) * length]
         }
-        Camera {
-            packed: part(&self.packed, index, n * PROJECTED_WIDTH),
-            colors: part(&self.colors, index, n * d),
-            opacities: part(&self.opacities, index, n),
-            background: self.background.as_ref().map(|b| part(b, index, d)),
+        Self {
+            packed: part(&buffers.packed, index, n * PROJECTED_WIDTH),
+            colors: part(&buffers.colors, index, n * d),
+            opacities: part(&buffers.opacities, index, n),
+            background: buffers.background.as_ref().map(|b| part(b, index, d)),
             channels: d,
         }
     }
 }
 
-pub(super) fn forward<T: Real>(
+impl RasterizeOps for Flex {
+    fn rasterize(inputs: RasterizeInputs<Self>, args: RasterizeArgs) -> FlexTensor {
+        Self::rasterize_tracked(inputs, &args).0
+    }
+}
+
+impl RasterizeBackend for Flex {
+    type RasterizeState = State;
+
+    fn rasterize_tracked(
+        OpInputs(inputs): RasterizeInputs<Self>,
+        args: &RasterizeArgs,
+    ) -> (FlexTensor, State) {
+        in_precision!(inputs.packed, forward, inputs, args)
+    }
+
+    fn rasterize_backward(
+        OpInputs(inputs): RasterizeInputs<Self>,
+        state: State,
+        grad_output: FlexTensor,
+        args: &RasterizeArgs,
+        needs_grad: RasterizeTensors<bool>,
+    ) -> RasterizeGradients<Self> {
+        in_precision!(
+            inputs.packed,
+            backward,
+            inputs,
+            state,
+            grad_output,
+            args,
+            needs_grad
+        )
+    }
+}
+
+fn forward<T: Real>(
     _: PhantomData<T>,
-    inputs: [FlexTensor; 3],
-    background: Option<FlexTensor>,
+    inputs: RasterizeTensors<FlexTensor, Option<FlexTensor>>,
     args: &RasterizeArgs,
 ) -> (FlexTensor, State) {
-    let inputs = Inputs::new(inputs, background);
-    let [c, _, d] = inputs.dims();
+    let buffers = inputs.map_inputs(Buffer::new);
+    let [c, _, d] = buffers.colors.dims();
     let (w, h) = (args.size.width as usize, args.size.height as usize);
     let shape = [c, h, w, d + 1];
     let mut image = Uncleared::<T>::new(shape.iter().product());
@@ -260,7 +279,7 @@ pub(super) fn forward<T: Real>(
     let slabs = (0..c).flat_map(|_| (0..h).step_by(TILE).map(slab));
     let mut slabs = image.parts(slabs).into_iter();
     for index in 0..c {
-        let camera = inputs.camera::<T>(index);
+        let camera = Camera::<T>::new(&buffers, index);
         match Listed::new(&camera, args) {
             Ok(listed) => {
                 let slabs = slabs.by_ref().take(h.div_ceil(TILE)).collect();
@@ -330,17 +349,16 @@ impl<T: Real> WithSimd for RowOfTiles<'_, T> {
     }
 }
 
-pub(super) fn backward<T: Real>(
+fn backward<T: Real>(
     _: PhantomData<T>,
-    inputs: [FlexTensor; 3],
-    background: Option<FlexTensor>,
+    inputs: RasterizeTensors<FlexTensor, Option<FlexTensor>>,
     state: State,
     grad_output: FlexTensor,
     args: &RasterizeArgs,
-    wanted: [bool; 4],
-) -> [Option<FlexTensor>; 4] {
-    let inputs = Inputs::new(inputs, background);
-    let [c, n, d] = inputs.dims();
+    needs_grad: RasterizeTensors<bool>,
+) -> RasterizeGradients<Flex> {
+    let buffers = inputs.map_inputs(Buffer::new);
+    let [c, n, d] = buffers.colors.dims();
     let pixels = args.size.width as usize * args.size.height as usize * (d + 1);
     let grad = Buffer::new(grad_output);
     let grad = grad.slice::<T>();
@@ -362,7 +380,7 @@ pub(super) fn backward<T: Real>(
             },
         );
     for (index, frame) in state.frames::<T>().iter().enumerate() {
-        let background = inputs.camera::<T>(index).background;
+        let background = Camera::<T>::new(&buffers, index).background;
         let view = View::new(&frame.listed, background, args);
         let grad = &grad[index * pixels..(index + 1) * pixels];
         // Every (tile, splat) pair writes its own row; each splat then sums its rows in order.
@@ -395,12 +413,18 @@ pub(super) fn backward<T: Real>(
     }
     // Nothing was rendered by a camera without a frame.
     rows.for_each(GradientRows::clear);
-    [
-        wanted[0].then(|| tensor(packed.written(), [c, n, PROJECTED_WIDTH])),
-        wanted[1].then(|| tensor(colors.written(), [c, n, d])),
-        wanted[2].then(|| tensor(opacities.written(), [c, n])),
-        wanted[3].then(|| tensor(of_background, [c, d])),
-    ]
+    RasterizeTensors {
+        packed: needs_grad
+            .packed
+            .then(|| tensor(packed.written(), [c, n, PROJECTED_WIDTH])),
+        colors: needs_grad
+            .colors
+            .then(|| tensor(colors.written(), [c, n, d])),
+        opacities: needs_grad
+            .opacities
+            .then(|| tensor(opacities.written(), [c, n])),
+        background: needs_grad.background.then(|| tensor(of_background, [c, d])),
+    }
 }
 
 /// Writes the sums of one row of tiles; gives its share of the background's gradient.

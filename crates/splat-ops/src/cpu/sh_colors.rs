@@ -18,46 +18,15 @@ use super::simd::{LANES, Lanes, for_each_block, vectorized};
 use super::spherical_harmonics::{
     COUNT_MAX, basis, basis_gradient, guarded_dot, is_zero, normalize,
 };
-use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH, ShInputs};
+use crate::backend::{
+    OpInputs, PROJECTED_EXTENT, PROJECTED_WIDTH, ShColorGradients, ShColorInputs, ShColorTensors,
+    ShColorsBackend, ShColorsOps,
+};
 use crate::settings::{ClampGradient, ShColorSettings};
 use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
 
 /// Gaussians per unit of parallel work. Fixed, so that sums over Gaussians have a fixed order.
 const CHUNK: usize = 512;
-
-/// The inputs.
-struct Tensors {
-    sh0: Buffer,
-    sh_rest: Option<Buffer>,
-    means: Buffer,
-    centers: Buffer,
-    seen: Option<Buffer>,
-}
-
-impl Tensors {
-    fn new(inputs: ShInputs<Flex>) -> Self {
-        Self {
-            sh0: Buffer::new(inputs.sh0),
-            sh_rest: inputs.sh_rest.map(Buffer::new),
-            means: Buffer::new(inputs.means),
-            centers: Buffer::new(inputs.centers),
-            seen: inputs.seen.map(Buffer::new),
-        }
-    }
-
-    fn slices<T: Real>(&self, settings: ShColorSettings) -> Inputs<'_, T> {
-        Inputs {
-            sh0: self.sh0.slice(),
-            rest: self.sh_rest.as_ref().map_or(&[], |rest| rest.slice()),
-            stored: self.sh_rest.as_ref().map_or(0, |rest| rest.dims::<3>()[1]),
-            means: self.means.slice(),
-            centers: self.centers.slice(),
-            seen: self.seen.as_ref().map(Buffer::slice),
-            degree: settings.degree,
-            recovers: settings.clamp_gradient == ClampGradient::Recovering,
-        }
-    }
-}
 
 /// The inputs as slices.
 struct Inputs<'a, T> {
@@ -75,6 +44,20 @@ struct Inputs<'a, T> {
 }
 
 impl<'a, T: Real> Inputs<'a, T> {
+    fn new(buffers: &'a ShColorTensors<Buffer, Option<Buffer>>, settings: ShColorSettings) -> Self {
+        let rest = buffers.sh_rest.as_ref();
+        Self {
+            sh0: buffers.sh0.slice(),
+            rest: rest.map_or(&[], Buffer::slice),
+            stored: rest.map_or(0, |rest| rest.dims::<3>()[1]),
+            means: buffers.means.slice(),
+            centers: buffers.centers.slice(),
+            seen: buffers.seen.as_ref().map(Buffer::slice),
+            degree: settings.degree,
+            recovers: settings.clamp_gradient == ClampGradient::Recovering,
+        }
+    }
+
     fn count(&self) -> usize {
         self.means.len() / 3
     }
@@ -275,13 +258,37 @@ fn evaluate_degree_backward<T: Real, const DEGREE: usize>(
     }
 }
 
-pub(super) fn forward<T: Real>(
+impl ShColorsOps for Flex {
+    fn sh_colors(OpInputs(inputs): ShColorInputs<Self>, settings: ShColorSettings) -> FlexTensor {
+        in_precision!(inputs.means, forward, inputs, settings)
+    }
+}
+
+impl ShColorsBackend for Flex {
+    fn sh_colors_backward(
+        OpInputs(inputs): ShColorInputs<Self>,
+        grad_colors: FlexTensor,
+        settings: ShColorSettings,
+        needs_grad: ShColorTensors<bool>,
+    ) -> ShColorGradients<Self> {
+        in_precision!(
+            grad_colors,
+            backward,
+            inputs,
+            grad_colors,
+            settings,
+            needs_grad
+        )
+    }
+}
+
+fn forward<T: Real>(
     _: PhantomData<T>,
-    inputs: ShInputs<Flex>,
+    inputs: ShColorTensors<FlexTensor, Option<FlexTensor>>,
     settings: ShColorSettings,
 ) -> FlexTensor {
-    let tensors = Tensors::new(inputs);
-    let inputs = tensors.slices::<T>(settings);
+    let buffers = inputs.map_inputs(Buffer::new);
+    let inputs = Inputs::<T>::new(&buffers, settings);
     let (c, n) = (inputs.centers.len() / 3, inputs.count());
     let mut colors = Uncleared::<T>::new(c * n * 3);
     let parts = colors.chunks_of_each(c, 3 * CHUNK);
@@ -445,21 +452,22 @@ fn add_scaled<T: Real>(sums: &mut [T], scale: T, values: Vec3<T>) {
     }
 }
 
-pub(super) fn backward<T: Real>(
+fn backward<T: Real>(
     _: PhantomData<T>,
-    inputs: ShInputs<Flex>,
+    inputs: ShColorTensors<FlexTensor, Option<FlexTensor>>,
     grad: FlexTensor,
     settings: ShColorSettings,
-    wanted: [bool; 4],
-) -> [Option<FlexTensor>; 4] {
-    let tensors = Tensors::new(inputs);
-    let inputs = tensors.slices::<T>(settings);
+    needs_grad: ShColorTensors<bool>,
+) -> ShColorGradients<Flex> {
+    let buffers = inputs.map_inputs(Buffer::new);
+    let inputs = Inputs::<T>::new(&buffers, settings);
     let grad = Buffer::new(grad);
     let grad = grad.slice::<T>();
     let (c, n) = (inputs.centers.len() / 3, inputs.count());
 
     let widths = [3, 3 * inputs.stored, 3];
-    let mut out = [0, 1, 2].map(|i| Uncleared::<T>::new(if wanted[i] { n * widths[i] } else { 0 }));
+    let needed = [needs_grad.sh0, needs_grad.sh_rest, needs_grad.means];
+    let mut out = [0, 1, 2].map(|i| Uncleared::<T>::new(if needed[i] { n * widths[i] } else { 0 }));
     let [sh0, rest, means] = &mut out;
     let mut parts = [(sh0, widths[0]), (rest, widths[1]), (means, widths[2])]
         .map(|(out, width)| out.chunks(CHUNK * width).into_iter());
@@ -476,7 +484,7 @@ pub(super) fn backward<T: Real>(
                 sh0,
                 rest,
                 means,
-                directions: wanted[2] || wanted[3],
+                directions: needs_grad.means || needs_grad.centers,
                 is_clear: true,
             };
             let views = grad.chunks_exact(3 * n).enumerate();
@@ -493,10 +501,13 @@ pub(super) fn backward<T: Real>(
         }
     }
     let [sh0, rest, means] = out.map(Uncleared::written);
-    [
-        wanted[0].then(|| tensor(sh0, [n, 1, 3])),
-        wanted[1].then(|| tensor(rest, [n, inputs.stored, 3])),
-        wanted[2].then(|| tensor(means, [n, 3])),
-        wanted[3].then(|| tensor(centers, [c, 3])),
-    ]
+    ShColorTensors {
+        sh0: needs_grad.sh0.then(|| tensor(sh0, [n, 1, 3])),
+        sh_rest: needs_grad
+            .sh_rest
+            .then(|| tensor(rest, [n, inputs.stored, 3])),
+        means: needs_grad.means.then(|| tensor(means, [n, 3])),
+        centers: needs_grad.centers.then(|| tensor(centers, [c, 3])),
+        seen: None,
+    }
 }
