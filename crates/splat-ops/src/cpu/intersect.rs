@@ -4,6 +4,7 @@
 //! after the other. Each emits its tiles; a counting sort brings these together tile by tile, and each tile sorts its own
 //! few by (depth, index).
 
+mod by_tile;
 mod emit;
 
 use core::ops::Range;
@@ -11,28 +12,19 @@ use core::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
-use super::buffer::overwritten;
-use super::parts::{Part, Uncleared};
-use super::rasterize::{MOMENTS, Splat, kept_per_pair};
+use super::parts::Uncleared;
 use super::real::Real;
+use super::splat::Splat;
+use super::tiles::{CHUNK, Grid};
 use crate::OpError;
 use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH};
 use crate::settings::RasterizeArgs;
+use by_tile::ByTile;
 use emit::{Emission, Emitted, emit};
-use splat_core::TILE_SIDE;
 use splat_core::memory::{in_units, lacking};
-
-/// Side of a tile in pixels.
-pub(super) const TILE: usize = TILE_SIDE;
-
-/// Splats per unit of parallel work.
-pub(super) const CHUNK: usize = 256;
 
 /// Gaussians per unit of the search for those that are seen.
 const SEARCHED: usize = 2048;
-
-/// Parts that the counting sort is done in, at most: each counts the tiles for itself.
-const PARTS: usize = 16;
 
 /// Pairs of a tile and a splat of one camera that can be listed: they are counted in 32 bits.
 const MAX_PAIRS: u64 = u32::MAX as u64;
@@ -63,19 +55,12 @@ fn check_memory(pairs: u64, bytes_per_pair: u64) -> Result<(), OpError> {
     }
 }
 
-/// Bytes that a pair takes at most at any one time: while the lists are made, or then with what the forward pass keeps of
-/// it and, where a backward pass follows, with its partial gradients.
-fn bytes_per_pair<T: Real>(channels: usize, args: &RasterizeArgs) -> u64 {
-    let number = size_of::<T>();
+/// Bytes that a pair takes at most at any one time: while the lists are made, or then with the bytes `kept` of it.
+fn bytes_per_pair(kept: usize) -> u64 {
     // Tiles of the emission, whose vectors grow by doubling; owners, instances, splats and places.
     let while_listed = (2 + 4) * size_of::<u32>();
     let listed = 2 * size_of::<u32>();
-    let partials = if args.backward {
-        (MOMENTS + channels) * number
-    } else {
-        0
-    };
-    while_listed.max(listed + kept_per_pair(number) + partials) as u64
+    while_listed.max(listed + kept) as u64
 }
 
 #[cfg(not(test))]
@@ -85,26 +70,6 @@ fn max_pairs() -> u64 {
 
 #[cfg(test)]
 use tests::max_pairs;
-
-/// Tiles of an image.
-#[derive(Clone, Copy)]
-pub(super) struct Grid {
-    pub(super) columns: usize,
-    pub(super) rows: usize,
-}
-
-impl Grid {
-    pub(super) fn new(args: &RasterizeArgs) -> Self {
-        Self {
-            columns: (args.size.width as usize).div_ceil(TILE),
-            rows: (args.size.height as usize).div_ceil(TILE),
-        }
-    }
-
-    fn tiles(self) -> usize {
-        self.columns * self.rows
-    }
-}
 
 /// The Gaussians among some that can be seen anywhere: not culled, not too faint, and no NaN decides it. One with a colour
 /// that is not finite is left out too: it would be in every pixel it touches.
@@ -148,10 +113,12 @@ pub(super) struct TileLists {
 }
 
 impl TileLists {
-    /// Lists for one camera, and its listed splats: packed splats `[N, 9]`, colours `[N, D]` and opacities `[N]`.
+    /// Lists for one camera, and its listed splats: packed splats `[N, 9]`, colours `[N, D]` and opacities `[N]`. Of each
+    /// pair the caller keeps `kept` bytes.
     pub(super) fn new<T: Real>(
         [packed, colors, opacities]: [&[T]; 3],
         args: &RasterizeArgs,
+        kept: usize,
     ) -> Result<(Self, Vec<Splat<T>>), OpError> {
         let count = opacities.len();
         let visible: Vec<Vec<u32>> = (0..count.div_ceil(SEARCHED))
@@ -181,7 +148,7 @@ impl TileLists {
         };
         // Where there may be too many they are counted before any is kept.
         let limit = max_pairs();
-        let each = bytes_per_pair::<T>(colors.len() / count.max(1), args);
+        let each = bytes_per_pair(kept);
         let most = listed.len() as u64 * grid.tiles() as u64;
         if most > limit || lacking(most.saturating_mul(each)).is_some() {
             let pairs = emitted(false).iter().map(|part| part.pairs).sum();
@@ -223,163 +190,6 @@ impl TileLists {
         let place = self.places.get(emitted)?;
         Some(place.load(Relaxed) as usize)
     }
-}
-
-/// The emitted instances brought together tile by tile, in the order in which they were emitted.
-struct ByTile {
-    /// By emitted instance: its splat.
-    owners: Vec<u32>,
-    /// Where the emitted instances of each splat end.
-    ends: Vec<u32>,
-    /// The emitted instances by tile.
-    instances: Vec<AtomicU32>,
-    /// Where each tile's begin, and the last one's end.
-    tiles: Vec<u32>,
-}
-
-impl ByTile {
-    /// By a counting sort.
-    fn new(emitted: &[Emitted], splats: usize, grid: Grid) -> Self {
-        let length = emitted.len().div_ceil(PARTS).max(1);
-        let mut counts: Vec<Vec<u32>> = emitted
-            .par_chunks(length)
-            .map(|part| {
-                let mut counts = vec![0; grid.tiles()];
-                for tile in part.iter().flat_map(|emitted| &emitted.tiles) {
-                    counts[*tile as usize] += 1;
-                }
-                counts
-            })
-            .collect();
-        // From how many there are to where they go: tile by tile, and in a tile part by part.
-        let mut tiles = Vec::with_capacity(grid.tiles() + 1);
-        let mut next = 0;
-        for tile in 0..grid.tiles() {
-            tiles.push(next);
-            for counts in &mut counts {
-                let own = core::mem::replace(&mut counts[tile], next);
-                next += own;
-            }
-        }
-        tiles.push(next);
-
-        let instances = unset(next as usize);
-        let mut owners = Uncleared::<u32>::new(next as usize);
-        let mut ends = Uncleared::<u32>::new(splats);
-        let mut start = 0;
-        let of_owners = owners.parts(emitted.iter().map(|emitted| emitted.tiles.len()));
-        let pieces: Vec<Piece> = (emitted.iter().zip(of_owners).zip(ends.chunks(CHUNK)))
-            .zip((0..).step_by(CHUNK))
-            .map(|(((emitted, owners), ends), first)| {
-                let next = start + emitted.tiles.len() as u32;
-                Piece {
-                    emitted,
-                    first,
-                    start: core::mem::replace(&mut start, next),
-                    owners,
-                    ends,
-                }
-            })
-            .collect();
-        pieces
-            .into_par_iter()
-            .chunks(length)
-            .zip(counts)
-            .for_each(|(part, mut next)| {
-                for piece in part {
-                    piece.place(&mut next, &instances);
-                }
-            });
-        Self {
-            owners: owners.written(),
-            ends: ends.written(),
-            instances,
-            tiles,
-        }
-    }
-
-    /// The lists of the given Gaussians: each tile's instances front to back, and in the order of the Gaussians where their
-    /// splats are equally deep.
-    fn sorted<T: Real>(self, listed: Vec<u32>, depths: &[T]) -> TileLists {
-        let count = self.instances.len();
-        let mut splats = Uncleared::<u32>::new(count);
-        let places = unset(count);
-        splats
-            .parts(
-                self.tiles
-                    .windows(2)
-                    .map(|ends| (ends[1] - ends[0]) as usize),
-            )
-            .into_par_iter()
-            .zip(&self.tiles)
-            .for_each_init(Vec::new, |keys, (splats, first)| {
-                let splats = splats.overwritten();
-                keys.clear();
-                // Instances are numbered as the splats are.
-                let instances = &self.instances[*first as usize..][..splats.len()];
-                keys.extend(instances.iter().map(|instance| {
-                    let instance = instance.load(Relaxed);
-                    let depth = depths[self.owners[instance as usize] as usize];
-                    depth.sort_key(instance)
-                }));
-                keys.sort_unstable();
-                for ((splat, place), key) in splats.iter_mut().zip(*first..).zip(&*keys) {
-                    let instance = T::index_of(*key) as usize;
-                    places[instance].store(place, Relaxed);
-                    *splat = self.owners[instance];
-                }
-            });
-        TileLists {
-            listed,
-            ends: self.ends,
-            places,
-            splats: splats.written(),
-            tiles: self.tiles,
-        }
-    }
-}
-
-/// What a chunk of splats emitted, and where that goes.
-struct Piece<'a> {
-    emitted: &'a Emitted,
-    /// The first of the splats.
-    first: u32,
-    /// The first of the instances.
-    start: u32,
-    owners: Part<'a, u32>,
-    ends: Part<'a, u32>,
-}
-
-impl Piece<'_> {
-    /// Puts each instance to the next place of its tile.
-    fn place(self, next: &mut [u32], instances: &[AtomicU32]) {
-        let Emitted { tiles, ends, .. } = self.emitted;
-        // How many splats begin at an instance, and with their sum which splat it is of.
-        let owners = self.owners.cleared();
-        for ((end, own), splat) in self.ends.overwritten().iter_mut().zip(ends).zip(1..) {
-            *end = self.start + own;
-            if let Some(owner) = owners.get_mut(*own as usize) {
-                *owner = splat;
-            }
-        }
-        let mut splat = 0;
-        for owner in owners {
-            splat = splat.max(*owner);
-            *owner = self.first + splat;
-        }
-        // The places of one piece are anywhere, but no two pieces have one in common.
-        for (tile, instance) in tiles.iter().zip(self.start..) {
-            let place = &mut next[*tile as usize];
-            instances[*place as usize].store(instance, Relaxed);
-            *place += 1;
-        }
-    }
-}
-
-/// Memory that several threads write, each its own places. Every place is written before any is read.
-fn unset(len: usize) -> Vec<AtomicU32> {
-    let values = overwritten::<u32>(len).into_iter();
-    values.map(AtomicU32::new).collect()
 }
 
 #[cfg(test)]

@@ -33,7 +33,9 @@ mod screen_statistics;
 mod sh_colors;
 mod simd;
 mod spherical_harmonics;
+mod splat;
 mod ssim;
+mod tiles;
 
 pub(crate) use awake::keep_awake;
 pub use instructions::InstructionSet;

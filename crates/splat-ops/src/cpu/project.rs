@@ -16,6 +16,7 @@
 //! V and e are taken in units of the splat's own size (`k` pixels), so that nothing over- or underflows, be the splat
 //! a millionth of a pixel or a million pictures wide.
 
+mod camera;
 mod gradient;
 mod splat;
 
@@ -26,8 +27,9 @@ use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
+use self::camera::Camera;
 use self::gradient::splat_backward;
-use self::splat::{Camera, Gaussian, Splat};
+use self::splat::{Gaussian, Splat};
 use super::buffer::{Buffer, tensor};
 use super::parts::Uncleared;
 use super::real::Real;
@@ -214,7 +216,7 @@ fn lanes_backward<T: Real, const OF_CAMERA: bool>(
         );
         let kept = |value: T| if splat.visible { value } else { T::ZERO };
         for i in 0..3 {
-            gradients[i][lane] = kept(g.mean[i]);
+            gradients[i][lane] = kept(g.camera.mean[i]);
             gradients[7 + i][lane] = kept(g.scale[i]);
         }
         for i in 0..4 {
@@ -223,12 +225,12 @@ fn lanes_backward<T: Real, const OF_CAMERA: bool>(
         if OF_CAMERA {
             for i in 0..3 {
                 for j in 0..3 {
-                    of_camera[3 * i + j][lane] += kept(g.w[i][j]);
+                    of_camera[3 * i + j][lane] += kept(g.camera.w[i][j]);
                 }
-                of_camera[9 + i][lane] += kept(g.t[i]);
+                of_camera[9 + i][lane] += kept(g.camera.t[i]);
             }
             for i in 0..4 {
-                of_camera[12 + i][lane] += kept(g.intrinsics[i]);
+                of_camera[12 + i][lane] += kept(g.camera.intrinsics[i]);
             }
         }
     }

@@ -3,10 +3,10 @@
 //! Splats are worked on side by side, as SIMD code. What depends on a splat, how many rows of tiles it reaches and how many
 //! tiles in each, is no branch wherever it can be avoided: it would be guessed wrongly as often as not.
 
-use super::super::rasterize::{GROUP, NUMBERS, Splat};
 use super::super::real::Real;
 use super::super::simd::{LANES, Lanes, vectorized};
-use super::{Grid, TILE};
+use super::super::splat::{GROUP, NUMBERS, Splat};
+use super::super::tiles::{Grid, TILE};
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::RasterizeArgs;
 

@@ -4,8 +4,8 @@ use core::ops::Range;
 
 use super::super::real::Real;
 use super::super::simd::prefetch;
-use super::View;
 use super::splat::{BLOCKS, GROUP, Splat};
+use super::view::View;
 
 /// How many: so many that what is kept of each fits the first-level cache, and few enough for eight bits.
 pub(super) const BATCH: usize = 128;

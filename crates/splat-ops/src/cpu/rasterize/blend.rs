@@ -8,9 +8,8 @@ use core::ops::Range;
 
 use macerator::Simd;
 
-use super::super::intersect::TILE;
 use super::super::real::Real;
-use super::View;
+use super::super::tiles::TILE;
 use super::batch::{BATCH, Batch, by_groups};
 use super::pixels::{Pixels, load_each};
 use super::splat::{
@@ -18,6 +17,7 @@ use super::splat::{
     row_of, square,
 };
 use super::trace::{ByBlock, Trace};
+use super::view::View;
 use super::work::Tally;
 
 /// The pixels of a tile while it is being blended, by block.

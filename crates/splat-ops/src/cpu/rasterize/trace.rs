@@ -2,7 +2,7 @@
 
 use core::ops::Range;
 
-use super::super::intersect::TILE;
+use super::super::tiles::TILE;
 use super::batch::BATCH;
 use super::splat::{Aligned, BLOCKS, Lanes};
 
@@ -10,7 +10,7 @@ use super::splat::{Aligned, BLOCKS, Lanes};
 pub(super) type ByBlock<T> = [Aligned<Lanes<T>>; BLOCKS];
 
 /// Bytes that is kept of each pair of a tile and a splat, at most, with numbers of this size.
-pub(in super::super) const fn kept_per_pair(number: usize) -> usize {
+pub(super) const fn kept_per_pair(number: usize) -> usize {
     size_of::<u16>() + number * (TILE * TILE).div_ceil(BATCH)
 }
 

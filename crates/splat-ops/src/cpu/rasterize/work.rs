@@ -5,9 +5,10 @@ use macerator::Simd;
 use rayon::prelude::*;
 
 use super::blend::BlendTile;
+use super::inputs::Camera;
 use super::splat::LANES;
 use super::trace::Trace;
-use super::{Camera, Listed, View};
+use super::view::{Listed, View};
 use crate::backend::PROJECTED_WIDTH;
 use crate::rasterize::{check_settings, per_camera};
 use crate::settings::RasterizeArgs;
