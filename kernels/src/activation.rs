@@ -16,7 +16,7 @@ use crate::exp::exp;
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 
-/// What the three scales and the opacity of each Gaussian, and their gradients, must move.
+/// Floors of the three scales and the opacity of each Gaussian, and of their gradients.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let values = 4 * sizes.gaussians;
     [

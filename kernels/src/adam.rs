@@ -130,7 +130,7 @@ fn adam_seen_rows(
     }
 }
 
-/// What a step of all parameters must move.
+/// Floor of a step of all parameters.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     let values = sizes.gaussians * sizes.parameters;
     Bytes {

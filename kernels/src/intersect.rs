@@ -144,7 +144,7 @@ impl fmt::Display for IntersectError {
 
 impl std::error::Error for IntersectError {}
 
-/// What listing must move for one camera, but for the sorts.
+/// Floor of listing for one camera, without the sorts.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     Bytes {
         read: 28 * sizes.gaussians + 64 * sizes.visible + 12 * sizes.instances,

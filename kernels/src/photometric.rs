@@ -23,7 +23,7 @@ use self::tile::{FIELDS, MOMENTS, PITCH, TILE_HEIGHT, TILE_WIDTH, UNITS};
 use crate::floor::{self, Bytes};
 use crate::launch::{Buffer, CUBE_UNITS, cube_count};
 
-/// What the loss of one view and its gradient must move; the photo is of 8 bits.
+/// Floors of the loss of one view and of its gradient; the photo is of 8 bits.
 pub(crate) fn floor(sizes: &floor::Sizes) -> [Bytes; 2] {
     let values = sizes.pixels() * sizes.channels;
     [
@@ -56,7 +56,7 @@ pub struct Images<'a> {
     pub rendered: &'a Buffer,
     /// As `kind` says.
     pub target: &'a Buffer,
-    /// What `target` holds.
+    /// How `target` holds its values.
     pub kind: TargetKind,
 }
 

@@ -107,7 +107,7 @@ fn project_forward(
     }
 }
 
-/// What forward and gradient of the Gaussians must move for one camera.
+/// Floors of forward and gradient of the Gaussians for one camera.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let n = sizes.gaussians;
     [

@@ -72,7 +72,7 @@ impl From<&splat_core::RasterizeSettings> for RasterizeSettings {
     }
 }
 
-/// What a forward pass leaves for its backward pass.
+/// State that a forward pass leaves for its backward pass.
 #[derive(Clone, Debug)]
 pub struct RasterizeState {
     /// The tiles' lists; without slots where the forward pass was to expect no sums in order.
@@ -92,7 +92,7 @@ pub struct RasterizeInputs {
     pub colors: Buffer,
     /// Opacities.
     pub opacities: Buffer,
-    /// What is behind all splats; zero if there is none.
+    /// Colour behind all splats; zero if there is none.
     pub background: Option<Buffer>,
     /// D.
     pub channels: usize,
@@ -207,7 +207,7 @@ fn blend(
     [output, transmittance, walked]
 }
 
-/// What forward and gradient must move for one camera, with lists that are there; the gradient summed in order.
+/// Floors of forward and gradient for one camera, with lists that are there; the gradient summed in order.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let (i, pixels, color) = (sizes.instances, sizes.pixels(), 4 * sizes.channels);
     // In the gradient: its sums per instance, written and read again, and what becomes of them per Gaussian.

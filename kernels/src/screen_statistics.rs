@@ -15,7 +15,7 @@ use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 use crate::math::is_finite;
 
-/// What the sums of one camera must move.
+/// Floor of the sums of one camera.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     Bytes {
         read: 20 * sizes.gaussians,

@@ -229,7 +229,7 @@ fn sh_backward_coefficients(
             let at = (c * gaussians + index) * 3;
             let d = Vec3::load(dirs, at);
             let g = Vec3::load(grad_colors, at);
-            // Of a splat that is not seen nothing is evaluated: were it NaN, zero times it would be too.
+            // A splat that is not seen is not evaluated: were it NaN, zero times it would be too.
             if g.max_abs() != 0.0f32 {
                 basis(d.scale(inverse_length(d)), &mut y, degree);
                 #[unroll]
@@ -271,7 +271,7 @@ fn sh_backward_dirs(
         let inverse = inverse_length(d);
         let v = d.scale(inverse);
         let first = index % gaussians * stored as usize * 3;
-        // Of a splat that is not seen nothing is evaluated: were it NaN, zero times it would be too, and reach the camera.
+        // A splat that is not seen is not evaluated: were it NaN, zero times it would be too, and reach the camera.
         if g.max_abs() != 0.0f32 {
             let mut weights = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
             #[unroll]

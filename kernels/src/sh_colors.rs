@@ -7,7 +7,7 @@
 //! Gradients of Gaussians are summed over cameras inside one unit; those of the centres by blocks of Gaussians and then
 //! over the blocks, in order: no atomics.
 //!
-//! What a camera culled is not evaluated, if the packed splats are given: it is black and passes nothing on.
+//! Gaussians that a camera culled are not evaluated, if the packed splats are given: they are black and pass nothing on.
 //!
 //! Floor, with K = `(degree + 1)²`: 12 bytes of mean and 12 K of coefficients read per Gaussian that a camera sees; for
 //! every camera 4 read and 12 written of each Gaussian, and about 9 K + 25 operations of each that it sees. Gradients:
@@ -26,7 +26,7 @@ use crate::launch::{Buffer, F16, F32, HalfBuffer, per_element};
 use crate::math::{Vec3, is_below_zero};
 use crate::sh::{basis, inverse_length, usable_degree};
 
-/// What forward and gradient must move for one camera.
+/// Floors of forward and gradient for one camera.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let (n, seen) = (sizes.gaussians, sizes.visible);
     let coefficients = 12 * sh_coefficient_count(sizes.degree) as u64;
@@ -60,7 +60,7 @@ impl ShRest {
     }
 }
 
-/// What the colours are made of.
+/// Inputs of the colours.
 #[derive(Clone, Debug)]
 pub struct ShColorInputs {
     /// Coefficients of degree 0 [N, 1, 3].

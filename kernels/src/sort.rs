@@ -185,7 +185,7 @@ fn scatter(
     let digits = comptime!(ranking.digits());
     let parts = comptime!(ranking.parts());
     let lanes = comptime!(ranking.lanes);
-    // Of every digit and part: first how often it occurs there, then how often in the block before that.
+    // For every digit and part: first how often it occurs there, then how often in the block before that.
     let mut before = Shared::new_slice(comptime!(digits * parts));
     let mut shared = Shared::new_slice(UNITS_USIZE);
     // Occurrences in the block of all lower digits.
@@ -270,7 +270,7 @@ pub fn variant(client: &Client) -> String {
     format!("{} bits a pass, ranks from {ranks}", ranking.digit_bits())
 }
 
-/// What the two sorts of a view must move: the visible splats by depth, then the instances by tile.
+/// Floor of the two sorts of a view: the visible splats by depth, then the instances by tile.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     let tile = u64::from(TILE);
     let tiles = sizes.width.div_ceil(tile) * sizes.height.div_ceil(tile);

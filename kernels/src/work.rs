@@ -1,4 +1,4 @@
-//! What the kernels of this crate were asked to do: launches, memory, waits. For benchmarks; counting costs one atomic
+//! Counters of what the kernels of this crate did: launches, memory, waits. For benchmarks; counting costs one atomic
 //! addition each.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -30,7 +30,7 @@ pub struct Work {
 }
 
 impl Work {
-    /// What was done after `earlier`.
+    /// The difference to `earlier`.
     #[must_use]
     pub fn since(self, earlier: Self) -> Self {
         Self {

@@ -28,5 +28,5 @@ pub const EXP: [f32; 6] = [
 /// `EXP_LN2_HIGH / 512` is ln(2) in so few bits that a multiple of it is exact.
 pub const EXP_LN2_HIGH: i32 = 355;
 
-/// What is left of ln(2).
+/// The rest of ln(2).
 pub const EXP_LN2_LOW: f32 = -2.121_944_4e-4;

@@ -157,7 +157,7 @@ tensors! {
         /// Opacities `[C, N]`.
         opacities,
     } optional {
-        /// What is behind all splats `[C, D]`; zero if there is none.
+        /// Colour behind all splats `[C, D]`; zero if there is none.
         background,
     }
 }

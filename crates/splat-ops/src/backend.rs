@@ -1,4 +1,4 @@
-//! What a backend provides: for each op a trait of the op as Burn dispatches it ([`ProjectOps`]), and for one with a
+//! The traits of a backend: for each op a trait of the op as Burn dispatches it ([`ProjectOps`]), and for one with a
 //! gradient of its own a trait of that ([`ProjectBackend`]). [`SplatBackend`] is all of them.
 //!
 //! Callers have checked all shapes; tensors need not be contiguous. A gradient function is told which gradients are
@@ -104,7 +104,7 @@ pub type SsimGradients<B> = SsimTensors<Option<FloatTensor<B>>>;
 /// carries it.
 #[derive(Debug, Clone, ExtensionType)]
 pub enum Target<B: Backend> {
-    /// Of any integer type, 0 to 255, for `level / 255`.
+    /// Levels of any integer type, 0 to 255, for `level / 255`.
     Levels(IntTensor<B>),
     /// As they are.
     Values(FloatTensor<B>),
@@ -211,7 +211,7 @@ pub trait ActivationOps: Backend {
 
 /// The gradient of [`ActivationOps`].
 pub trait ActivationBackend: ActivationOps {
-    /// Of the input x, given x, the output y, and the gradient of y.
+    /// Gradient of the input x, given x, the output y, and the gradient of y.
     fn activation_backward(
         x: FloatTensor<Self>,
         y: FloatTensor<Self>,
@@ -225,7 +225,7 @@ pub trait ActivationBackend: ActivationOps {
 pub trait RasterizeOps: Backend {
     /// `[C, H, W, D + 1]`, the last channel being alpha.
     ///
-    /// What goes wrong is reported to `args.errors`; the image is then zero, and the gradients that the state leads to
+    /// Errors are reported to `args.errors`; the image is then zero, and the gradients that the state leads to
     /// are.
     fn rasterize(
         #[extension_type] inputs: RasterizeInputs<Self>,
@@ -306,7 +306,7 @@ pub trait PhotometricBackend: PhotometricOps {
         args: &SsimArgs,
     ) -> (FloatTensor<Self>, FloatTensor<Self>);
 
-    /// Of the rendered images `[B, H, W, E]`, given what was kept and the gradient `[2]` of the losses.
+    /// Gradient of the rendered images `[B, H, W, E]`, given what was kept and the gradient `[2]` of the losses.
     fn photometric_backward(
         rendered: FloatTensor<Self>,
         target: Target<Self>,

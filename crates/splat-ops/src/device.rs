@@ -1,4 +1,4 @@
-//! What else there is to do with a device. Most of it is for benchmarks of CubeCL devices: what they are, what the kernels
+//! Device utilities, mainly for benchmarks of CubeCL devices: what they are, what the kernels
 //! did there, how fast their memory is. Without such a device (or the features for one) there is nothing to tell.
 
 use burn::tensor::{Device, Tensor};
@@ -9,7 +9,7 @@ use crate::check::is_flex;
 use crate::{Projected, RasterizeSettings, RasterizeWork};
 pub use splat_core::memory::available_memory;
 
-/// What the kernels did since the process began, over all devices; a piece of work is a difference of two.
+/// Work of the kernels since the process began, over all devices; a piece of work is a difference of two.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct KernelWork {
     /// Kernels of ours that were launched; those of Burn are not seen here.
@@ -79,7 +79,7 @@ pub fn keep_awake(device: &Device) {
     }
 }
 
-/// What is known of a CubeCL device, and which variant of the kernels runs there: name and value, in an order for
+/// Properties of a CubeCL device, and which variant of the kernels runs there: name and value, in an order for
 /// reading. `None` for any other device.
 pub fn describe(device: &Device) -> Option<Vec<(&'static str, String)>> {
     #[cfg(feature = "cube")]
@@ -103,7 +103,7 @@ pub fn reads_half(device: &Device) -> bool {
     }
 }
 
-/// What the kernels did so far.
+/// Work of the kernels so far.
 pub fn kernel_work() -> KernelWork {
     #[cfg(feature = "cube")]
     {
@@ -120,7 +120,7 @@ pub fn kernel_work() -> KernelWork {
 }
 
 impl KernelWork {
-    /// What was done after `earlier`.
+    /// The difference to `earlier`.
     #[must_use]
     pub fn since(self, earlier: Self) -> Self {
         Self {

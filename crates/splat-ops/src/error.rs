@@ -1,4 +1,4 @@
-//! What can go wrong in an op, and how it gets past Burn's dispatch.
+//! Errors of the ops, and how they get past Burn's dispatch.
 
 use std::sync::{Arc, OnceLock};
 
@@ -28,7 +28,7 @@ pub enum OpError {
         tensor: &'static str,
         /// Its type.
         got: DType,
-        /// What is wrong with it.
+        /// Why it is refused.
         reason: &'static str,
     },
     /// An ordinary argument is out of range.
@@ -36,7 +36,7 @@ pub enum OpError {
     Argument {
         /// The op.
         op: &'static str,
-        /// What is wrong and what is allowed.
+        /// The fault, and the range allowed.
         what: String,
     },
     /// The splats touch more tiles than one call can list.
@@ -62,9 +62,9 @@ pub enum OpError {
         op: &'static str,
         /// Pairs of a tile and a splat that touches it.
         pairs: u64,
-        /// What they need, in words.
+        /// Memory needed, in words.
         needed: String,
-        /// What is left, in words.
+        /// Memory left, in words.
         left: String,
     },
     /// A kernel needs more buffers than the device lets it have.

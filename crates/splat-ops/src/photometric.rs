@@ -9,7 +9,7 @@ use crate::backend::{self, PhotometricOps};
 use crate::check::Checker;
 use crate::settings::SsimArgs;
 
-/// What [`photometric`] compares with, `[B, H, W, D]`.
+/// Images that [`photometric`] compares with, `[B, H, W, D]`.
 #[derive(Debug, Clone)]
 pub enum Target {
     /// 8-bit levels, 0 to 255, that stand for `level / 255`. Of type U8 they are read as they are, on GPUs of type I32 too.
@@ -30,7 +30,7 @@ impl From<Tensor<4>> for Target {
     }
 }
 
-/// What [`photometric`] measures.
+/// Losses that [`photometric`] measures.
 #[derive(Debug, Clone)]
 pub struct Photometric {
     losses: Tensor<1>,

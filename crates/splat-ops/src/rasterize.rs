@@ -126,7 +126,7 @@ pub(crate) fn check_settings(settings: &RasterizeSettings) -> Result<(), OpError
     })
 }
 
-/// What is the same for all of `cameras`, once for each. For one camera there is nothing to repeat, and nothing to sum in
+/// One tensor for all `cameras`, repeated for each. For one camera there is nothing to repeat, and nothing to sum in
 /// the gradient.
 fn repeat<const R: usize>(one: Tensor<R>, cameras: usize) -> Tensor<R> {
     match cameras {

@@ -1,4 +1,4 @@
-//! What density control wants to know of every step (3DGS section 5.2).
+//! Statistics of every step for density control (3DGS section 5.2).
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;

@@ -10,7 +10,7 @@ use crate::math::{Mat3, Quat, Vec3};
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(super) struct Gradient {
-    /// Of the camera, and of the mean.
+    /// Gradients of the camera and of the mean.
     pub camera: CameraGradient,
     pub quat: Quat,
     pub scale: Vec3,

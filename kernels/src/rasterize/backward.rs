@@ -406,7 +406,7 @@ pub(super) fn rasterize_backward<A: Numeric>(
     let blocks = comptime!(plan.blocks());
 
     let mut batch = Batch::new(plan, width);
-    // Of every splat of the batch: its slot, or without slots its index.
+    // Slot of every splat of the batch; without slots its index.
     let mut targets = Shared::new_slice(BATCH);
     // Place k of the group, value, block.
     let mut partials = Shared::new_slice(comptime!(group * values * blocks));

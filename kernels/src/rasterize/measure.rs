@@ -1,4 +1,4 @@
-//! What the rasteriser keeps, takes and does, in numbers and words.
+//! Memory and work of the rasteriser, in numbers and words.
 
 use cubecl::prelude::*;
 
@@ -14,7 +14,7 @@ pub struct Kept;
 impl Kept {
     /// Where the list begins and ends.
     pub const PER_TILE: u64 = 8;
-    /// What is left of the light, and how many splats were walked. The image has four bytes per channel and for alpha.
+    /// Transmittance, and number of splats walked. The image has four bytes per channel and for alpha.
     pub const PER_PIXEL: u64 = 8;
 
     /// For sums in order: place in the order of depth, and where the slots begin, twice: by splat and by place.
@@ -58,7 +58,7 @@ pub fn variant(client: &Client) -> String {
     )
 }
 
-/// What [`Sums::Atomic`] is on this device, in words.
+/// How [`Sums::Atomic`] is done on this device, in words.
 pub fn unordered(client: &Client) -> &'static str {
     match Sums::Atomic.unordered(client) {
         Sums::Exchange => "atomic exchanges",

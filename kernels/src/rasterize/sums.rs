@@ -28,7 +28,7 @@ pub enum Sums {
 }
 
 impl Sums {
-    /// What this device can do without an order.
+    /// The way without an order that this device has.
     pub(super) fn unordered(self, client: &Client) -> Self {
         let float = Type::atomic(f32::elem_type_native());
         let usage = client.properties().atomic_type_usage(float);

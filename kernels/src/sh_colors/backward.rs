@@ -93,7 +93,7 @@ fn sh_colors_backward_gaussians<R: Float>(
         for camera in 0..cameras as usize {
             let index = camera * gaussians + gaussian;
             let g = Vec3::load(grad_colors, index * 3);
-            // Of a splat without a gradient nothing is evaluated: were it NaN, zero times it would be too.
+            // A splat without a gradient is not evaluated: were it NaN, zero times it would be too.
             if g.max_abs() != 0.0f32 && is_seen(packed, index, asked) {
                 let sight = sight(means, centers, gaussian, camera);
                 basis(sight.unit, &mut y, degree);

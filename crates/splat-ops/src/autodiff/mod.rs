@@ -24,7 +24,7 @@ use burn::backend::autodiff::grads::Gradients;
 use burn::backend::autodiff::ops::{Backward, NodeGuard, Ops, OpsKind};
 use burn::backend::{Autodiff, Backend, tensor::FloatTensor};
 
-/// What an op saves for the gradients of its N parents.
+/// State that an op saves for the gradients of its N parents.
 trait Saved<B: Backend, const N: usize>: Clone + Debug + Send + 'static {
     /// Gradients of the parents that need one, given that of the output.
     fn gradients(self, grad: FloatTensor<B>, needs_grad: [bool; N]) -> [Option<FloatTensor<B>>; N];

@@ -42,7 +42,7 @@ pub(crate) trait Real:
 {
     const ZERO: Self;
     const ONE: Self;
-    /// What [`sort_key`](Self::sort_key) makes.
+    /// Type of [`sort_key`](Self::sort_key).
     type SortKey: Ord + Copy + Send + Sync;
 
     /// An integer that sorts as the number does (negative ones too), and equal numbers as `index` does.

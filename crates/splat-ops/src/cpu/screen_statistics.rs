@@ -86,7 +86,7 @@ fn add<T: Real>(
                 if packed.at(c, n, PROJECTED_EXTENT) > T::ZERO {
                     let (x, y) = (gradient.at(c, n, 0) * width, gradient.at(c, n, 1) * height);
                     let length = (x * x + y * y).sqrt();
-                    // What is not finite must not hide the other views of the same Gaussian.
+                    // One that is not finite must not hide the other views of the same Gaussian.
                     sum += if length.is_finite() { length } else { T::ZERO };
                     count += T::ONE;
                 }

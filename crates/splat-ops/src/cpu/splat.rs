@@ -10,10 +10,10 @@ pub(super) const UNIT: f64 = 0.849_321_800_288_019_1;
 /// How many numbers a splat has beside its colour.
 pub(super) const NUMBERS: usize = 11;
 
-/// So many channels are worked on at once.
+/// Channels that are worked on at once.
 pub(super) const GROUP: usize = 4;
 
-/// What the inner loops need of a splat, in one line of the cache if in single precision. Its ellipse is the part of it that
+/// A splat as the inner loops need it, in one line of the cache if in single precision. Its ellipse is the part of it that
 /// can pass the `alpha_min` test: `sigma <= cut`, cut being `ln(opacity / alpha_min)`, widened by a little so that rounding
 /// never drops a pixel.
 #[derive(Debug, Clone, Copy, Default)]

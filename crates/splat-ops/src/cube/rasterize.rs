@@ -56,7 +56,7 @@ fn op_error(error: IntersectError) -> OpError {
     }
 }
 
-/// Of all kernels, those of the rasteriser's gradient bind the most. wgpu would refuse them when they are launched, which
+/// The rasteriser's gradient binds the most buffers. wgpu would refuse its kernels when they are launched, which
 /// shows when a gradient is read, if it is.
 fn enough_bindings(client: &Client) -> Result<(), OpError> {
     let (bound, needed) = (bindable_buffers(client), MOST_BUFFERS);

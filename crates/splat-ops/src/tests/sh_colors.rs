@@ -33,7 +33,7 @@ impl Leaves {
             means[..3].copy_from_slice(&centers[..3]);
             sh0[3..6].fill(-9.0);
             sh_rest[2 * 45..3 * 45].fill(f64::NAN);
-            // Of a dark one a channel is exactly on the clamp at any degree.
+            // A dark one has a channel exactly on the clamp at any degree.
             sh0[3 * 4] = -0.5 / 0.282_094_791_773_878_14;
             for k in 0..15 {
                 sh_rest[4 * 45 + 3 * k] = 0.0;

@@ -128,7 +128,7 @@ impl ByTile {
     }
 }
 
-/// What a chunk of splats emitted, and where that goes.
+/// Tiles that a chunk of splats emitted, and where they go.
 struct Piece<'a> {
     emitted: &'a Emitted,
     /// The first of the splats.

@@ -16,7 +16,7 @@ const ROWS: usize = 4;
 /// Tiles of a row that are written at once, whether a splat reaches as many or not.
 const RUN: usize = 4;
 
-/// What is the same for all splats of a view.
+/// Inputs and settings that all splats of a view share.
 pub(super) struct Emission<'a, T> {
     packed: &'a [T],
     colors: &'a [T],
@@ -88,7 +88,7 @@ vectorized! {
 
 /// Splats side by side.
 struct Block<T> {
-    /// Of a packed splat the mean and the inverse Cholesky factor, and the opacity.
+    /// Mean and inverse Cholesky factor of a packed splat, and the opacity.
     given: [Lanes<T>; 6],
     /// The splats, number by number.
     splats: [Lanes<T>; NUMBERS],

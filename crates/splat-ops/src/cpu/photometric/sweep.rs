@@ -29,7 +29,7 @@ pub(super) const MOMENTS: usize = 4;
 /// Derivatives by mx, q, p, all but the second halved.
 pub(super) const FIELDS: usize = 3;
 
-/// What is the same for all bands.
+/// Inputs and settings that all bands share.
 pub(super) struct Sweep<'a, T> {
     rows: Rows<'a, T>,
     height: usize,

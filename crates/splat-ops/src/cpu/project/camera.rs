@@ -21,10 +21,10 @@ pub(super) struct Sight<T> {
 /// Gradients of a camera through one point, and of the point.
 pub(super) struct CameraGradient<T> {
     pub(super) mean: Vec3<T>,
-    /// Of W and t.
+    /// Gradients of W and t.
     pub(super) w: Mat3<T>,
     pub(super) t: Vec3<T>,
-    /// Of fx, fy, cx, cy.
+    /// Gradients of fx, fy, cx, cy.
     pub(super) intrinsics: [T; 4],
 }
 

@@ -7,7 +7,7 @@ use super::splat::{Gaussian, Splat};
 
 /// Gradients of one (camera, Gaussian) pair.
 pub(super) struct Gradient<T> {
-    /// Of the camera, and of the mean.
+    /// Gradients of the camera and of the mean.
     pub(super) camera: CameraGradient<T>,
     pub(super) quat: [T; 4],
     pub(super) scale: Vec3<T>,

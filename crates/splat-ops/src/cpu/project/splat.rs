@@ -16,7 +16,7 @@ pub(super) struct Gaussian<T> {
     pub(super) scale: Vec3<T>,
 }
 
-/// What the forward computes on its way; the backward computes it again.
+/// Intermediate values of the forward pass; the backward pass computes them again.
 pub(super) struct Splat<T> {
     /// Whether it is not culled. Where it is, all other fields may hold anything.
     pub(super) visible: bool,

@@ -170,7 +170,7 @@ fn transposed(rows: [u8; 8]) -> [u8; 8] {
     bits.to_le_bytes()
 }
 
-/// Of every byte the bits that are set, and how many they are.
+/// The set bits of every byte, and how many they are.
 static BITS: [([u8; 8], u8); 256] = {
     let mut table = [([0; 8], 0); 256];
     let mut byte = 0;

@@ -31,7 +31,7 @@ pub(super) struct BlendTile<T> {
     /// D of each block.
     colors: Vec<Aligned<Lanes<T>>>,
     batch: Batch<T>,
-    /// Of every splat that reaches the block at hand: `|z|^2`, then falloffs, then weights.
+    /// Values of every splat that reaches the block at hand: `|z|^2`, then falloffs, then weights.
     weights: [Aligned<Lanes<T>>; BATCH],
 }
 
@@ -361,11 +361,11 @@ impl<T: Real> BlendTile<T> {
     }
 }
 
-/// What is on its way to the pixels of a block, and what of it has arrived.
+/// Light on its way to the pixels of a block, and the part that has arrived.
 struct Light<S: Simd, T: Real, const COUNT: usize> {
     /// Transmittance.
     left: Pixels<S, T>,
-    /// Of a group of channels.
+    /// Colours of a group of channels.
     colors: [Pixels<S, T>; COUNT],
 }
 

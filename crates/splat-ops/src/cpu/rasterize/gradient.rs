@@ -45,7 +45,7 @@ pub(super) struct GradientTile<S: Simd, T: Real> {
     /// D of each block: gradient of the image.
     grad: Vec<Aligned<Lanes<T>>>,
     batch: Batch<T>,
-    /// Of every splat that reaches the block at hand.
+    /// Values of every splat that reaches the block at hand.
     pairs: Vec<Aligned<Pairs<T>>>,
     /// c . grad of the same, of channels beyond the first group.
     toward: Vec<Aligned<Lanes<T>>>,
@@ -331,7 +331,7 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
         }
     }
 
-    /// What the loss thinks of some further channels of the splats' colours at every pixel, c . grad.
+    /// Share of some further channels of the splats' colours in the loss at every pixel, c . grad.
     #[inline(always)]
     fn look<const COUNT: usize>(
         &mut self,

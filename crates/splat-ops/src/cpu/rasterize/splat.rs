@@ -102,7 +102,7 @@ pub(super) struct Centres<S: Simd, T: Real> {
 }
 
 impl<S: Simd, T: Real> Centres<S, T> {
-    /// Of a block of the tile with this corner.
+    /// Centres of a block of the tile with this corner.
     #[inline(always)]
     pub(super) fn new(block: usize, [left, top]: [T; 2]) -> Self {
         let from = |corner: T, block: usize| corner + T::of_index((block * SIDE) as i32);

@@ -18,10 +18,10 @@ use super::trace::{Trace, kept_per_pair};
 use crate::OpError;
 use crate::settings::RasterizeArgs;
 
-/// So many partial gradients before its turn one is fetched.
+/// Prefetch distance, in partial gradients.
 const AHEAD: usize = 16;
 
-/// What the forward keeps for the backward: a [`Frame`] per camera, none of an image that was not rendered.
+/// State that the forward pass keeps for the backward pass: a [`Frame`] per camera, none of an image that was not rendered.
 #[derive(Debug, Clone)]
 pub struct State(Arc<dyn Any + Send + Sync>);
 
@@ -41,7 +41,7 @@ impl State {
 pub(super) struct Listed<T> {
     pub(super) lists: TileLists,
     pub(super) splats: Vec<Splat<T>>,
-    /// Of each splat the channels of its colour that it does not have with it.
+    /// Channels of each splat's colour that it does not have with it.
     pub(super) further_colors: Vec<T>,
     pub(super) channels: usize,
 }
@@ -110,7 +110,7 @@ impl<T: Real> Listed<T> {
         sums
     }
 
-    /// Of a few channels.
+    /// The same for a few channels of the colour.
     #[inline(always)]
     pub(super) fn sum_colors<const COUNT: usize>(
         &self,

@@ -14,7 +14,7 @@ use crate::rasterize::{check_settings, per_camera};
 use crate::settings::RasterizeArgs;
 use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
 
-/// What [`rasterize`](crate::rasterize) does, in numbers.
+/// Work of [`rasterize`](crate::rasterize), in numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RasterizeWork {
     /// Pairs of a tile and a splat that is listed in it.
