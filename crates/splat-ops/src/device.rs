@@ -83,7 +83,7 @@ pub fn keep_awake(device: &Device) {
 /// reading. `None` for any other device.
 pub fn describe(device: &Device) -> Option<Vec<(&'static str, String)>> {
     #[cfg(feature = "cube")]
-    return client(device).map(|client| splat_kernels::describe(&client));
+    return client(device).map(|client| splat_kernels::device_info(&client));
     #[cfg(not(feature = "cube"))]
     {
         let _ = device;

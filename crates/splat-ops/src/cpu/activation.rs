@@ -8,9 +8,9 @@ use burn::tensor::{DType, TensorData};
 use rayon::prelude::*;
 
 use super::buffer::Buffer;
-use super::parts::Uncleared;
 use super::real::Real;
 use super::simd::vectorized;
+use super::uninit::Uncleared;
 use crate::backend::{ActivationBackend, ActivationOps};
 use crate::composed;
 use crate::settings::Activation;

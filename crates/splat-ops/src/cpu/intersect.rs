@@ -12,10 +12,10 @@ use core::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
-use super::parts::Uncleared;
 use super::real::Real;
 use super::splat::Splat;
 use super::tiles::{CHUNK, Grid};
+use super::uninit::Uncleared;
 use crate::OpError;
 use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH};
 use crate::settings::RasterizeArgs;

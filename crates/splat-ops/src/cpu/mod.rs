@@ -21,7 +21,6 @@ pub(crate) mod buffer;
 mod instructions;
 mod intersect;
 mod math;
-mod parts;
 mod photometric;
 #[cfg(test)]
 pub(crate) mod poison;
@@ -36,6 +35,7 @@ mod spherical_harmonics;
 mod splat;
 mod ssim;
 mod tiles;
+mod uninit;
 
 pub(crate) use awake::keep_awake;
 pub use instructions::InstructionSet;

@@ -13,8 +13,8 @@ use burn::backend::{Flex, TensorMetadata};
 use rayon::prelude::*;
 
 use super::buffer::{Buffer, tensor};
-use super::parts::{Part, Uncleared};
 use super::real::Real;
+use super::uninit::{Part, Uncleared};
 use crate::backend::{PhotometricBackend, PhotometricOps, Target};
 use crate::settings::SsimArgs;
 use pictures::{Pictures, spread};

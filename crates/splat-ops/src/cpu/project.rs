@@ -31,9 +31,9 @@ use self::camera::Camera;
 use self::gradient::splat_backward;
 use self::splat::{Gaussian, Splat};
 use super::buffer::{Buffer, tensor};
-use super::parts::Uncleared;
 use super::real::Real;
 use super::simd::{LANES, Lanes, for_each_block, vectorized};
+use super::uninit::Uncleared;
 use crate::backend::{
     OpInputs, PROJECTED_WIDTH, ProjectBackend, ProjectGradients, ProjectInputs, ProjectOps,
     ProjectTensors,

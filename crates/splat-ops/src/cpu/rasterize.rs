@@ -30,10 +30,10 @@ use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
 use super::buffer::{Buffer, tensor, zeros};
-use super::parts::Uncleared;
 use super::real::Real;
 use super::schedule::heaviest_first;
 use super::tiles::{CHUNK, TILE};
+use super::uninit::Uncleared;
 use crate::backend::{
     OpInputs, PROJECTED_WIDTH, RasterizeBackend, RasterizeGradients, RasterizeInputs, RasterizeOps,
     RasterizeTensors,

@@ -10,10 +10,10 @@ use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
 use super::buffer::{Buffer, tensor};
-use super::parts::Uncleared;
 use super::real::Real;
 use super::simd::{LANES, Lanes, for_each_block, vectorized};
 use super::spherical_harmonics::{COUNT_MAX, basis, normalize};
+use super::uninit::Uncleared;
 use crate::backend::{
     OpInputs, PROJECTED_EXTENT, PROJECTED_WIDTH, ShColorInputs, ShColorTensors, ShColorsOps,
 };

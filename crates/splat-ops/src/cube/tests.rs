@@ -126,25 +126,28 @@ impl Scene {
             &device,
         );
         let grads = (image.clone() * weights).sum().backward();
-        let host = |data: TensorData| data.try_to_vec::<f32>().unwrap();
+        let to_host = |data: TensorData| data.try_to_vec::<f32>().unwrap();
         vec![
-            ("image", host(image.into_data())),
-            ("means", host(means.grad(&grads).unwrap().into_data())),
-            ("quats", host(quats.grad(&grads).unwrap().into_data())),
-            ("scales", host(scales.grad(&grads).unwrap().into_data())),
-            ("viewmats", host(viewmats.grad(&grads).unwrap().into_data())),
+            ("image", to_host(image.into_data())),
+            ("means", to_host(means.grad(&grads).unwrap().into_data())),
+            ("quats", to_host(quats.grad(&grads).unwrap().into_data())),
+            ("scales", to_host(scales.grad(&grads).unwrap().into_data())),
+            (
+                "viewmats",
+                to_host(viewmats.grad(&grads).unwrap().into_data()),
+            ),
             (
                 "intrinsics",
-                host(intrinsics.grad(&grads).unwrap().into_data()),
+                to_host(intrinsics.grad(&grads).unwrap().into_data()),
             ),
-            ("coeffs", host(coeffs.grad(&grads).unwrap().into_data())),
+            ("coeffs", to_host(coeffs.grad(&grads).unwrap().into_data())),
             (
                 "opacities",
-                host(opacities.grad(&grads).unwrap().into_data()),
+                to_host(opacities.grad(&grads).unwrap().into_data()),
             ),
             (
                 "background",
-                host(background.grad(&grads).unwrap().into_data()),
+                to_host(background.grad(&grads).unwrap().into_data()),
             ),
         ]
     }

@@ -96,13 +96,19 @@ impl Leaves {
         weights: Tensor<3>,
     ) -> Vec<(&'static str, Vec<f64>)> {
         let grads = (colors.clone() * weights).sum().backward();
-        let host = |data: TensorData| data.convert::<f64>().try_into_vec::<f64>().unwrap();
-        let mut found = vec![("colors", host(colors.into_data()))];
+        let to_host = |data: TensorData| data.convert::<f64>().try_into_vec::<f64>().unwrap();
+        let mut found = vec![("colors", to_host(colors.into_data()))];
         for (name, leaf) in [("sh0", &self.sh0), ("sh_rest", &self.sh_rest)] {
-            found.extend(leaf.grad(&grads).map(|grad| (name, host(grad.into_data()))));
+            found.extend(
+                leaf.grad(&grads)
+                    .map(|grad| (name, to_host(grad.into_data()))),
+            );
         }
         for (name, leaf) in [("means", &self.means), ("centers", &self.centers)] {
-            found.extend(leaf.grad(&grads).map(|grad| (name, host(grad.into_data()))));
+            found.extend(
+                leaf.grad(&grads)
+                    .map(|grad| (name, to_host(grad.into_data()))),
+            );
         }
         found
     }

@@ -7,9 +7,9 @@ use rayon::prelude::*;
 use super::TileLists;
 use super::emit::Emitted;
 use crate::cpu::buffer::overwritten;
-use crate::cpu::parts::{Part, Uncleared};
 use crate::cpu::real::Real;
 use crate::cpu::tiles::{CHUNK, Grid};
+use crate::cpu::uninit::{Part, Uncleared};
 
 /// Parts that the counting sort is done in, at most: each counts the tiles for itself.
 const PARTS: usize = 16;

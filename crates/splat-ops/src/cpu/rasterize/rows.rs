@@ -5,9 +5,9 @@ use macerator::{Arch, Simd, Vector, WithSimd};
 #[cfg(target_arch = "x86_64")]
 use super::super::instructions::InstructionSet;
 use super::super::instructions::registers;
-use super::super::parts::Part;
 use super::super::real::Real;
 use super::super::schedule::heaviest_first;
+use super::super::uninit::Part;
 use super::batch::by_groups;
 use super::blend::BlendTile;
 use super::gradient::{GradientTile, MOMENTS};

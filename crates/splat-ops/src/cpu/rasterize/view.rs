@@ -7,10 +7,10 @@ use rayon::prelude::*;
 use tracing::trace_span;
 
 use super::super::intersect::TileLists;
-use super::super::parts::Uncleared;
 use super::super::real::Real;
 use super::super::simd::prefetch;
 use super::super::tiles::{CHUNK, Grid, TILE};
+use super::super::uninit::Uncleared;
 use super::gradient::MOMENTS;
 use super::inputs::Camera;
 use super::splat::{GROUP, Splat};

@@ -40,15 +40,15 @@ pub fn rasterize_work<const DC: usize, const DO: usize>(
     check_settings(settings)?;
     let (colors, opacities) = per_camera(projected, colors, opacities)?;
     let [c, n, d] = colors.dims();
-    let host = |tensor: Tensor<3>| {
+    let to_host = |tensor: Tensor<3>| {
         tensor
             .into_data()
             .convert::<f32>()
             .try_into_vec::<f32>()
             .unwrap_or_default()
     };
-    let (packed, colors) = (host(projected.packed()), host(colors));
-    let opacities = host(opacities.reshape([c as i32, -1, 1]));
+    let (packed, colors) = (to_host(projected.packed()), to_host(colors));
+    let opacities = to_host(opacities.reshape([c as i32, -1, 1]));
     let args = RasterizeArgs {
         size: projected.image_size(),
         settings: *settings,

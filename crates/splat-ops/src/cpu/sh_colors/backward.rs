@@ -9,10 +9,10 @@ use rayon::prelude::*;
 
 use super::super::buffer::{Buffer, tensor};
 use super::super::math::{Vec3, dot};
-use super::super::parts::{Part, Uncleared};
 use super::super::real::Real;
 use super::super::simd::{LANES, Lanes, for_each_block, vectorized};
 use super::super::spherical_harmonics::{COUNT_MAX, basis_gradient, guarded_dot, is_zero};
+use super::super::uninit::{Part, Uncleared};
 use super::{CHUNK, Inputs, evaluate};
 use crate::backend::{OpInputs, ShColorGradients, ShColorInputs, ShColorTensors, ShColorsBackend};
 use crate::settings::ShColorSettings;

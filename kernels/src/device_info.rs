@@ -7,7 +7,7 @@ use crate::launch::{MOST_BUFFERS, bindable_buffers};
 use crate::{rasterize, sort};
 
 /// Properties of the client's device, by name, in an order for reading.
-pub fn describe(client: &Client) -> Vec<(&'static str, String)> {
+pub fn device_info(client: &Client) -> Vec<(&'static str, String)> {
     let (identity, hardware) = (&client.properties().identity, &client.properties().hardware);
     let planes = match (hardware.plane_size_min, hardware.plane_size_max) {
         (least, most) if least == most => format!("{most} units"),
