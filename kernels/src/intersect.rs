@@ -2,7 +2,7 @@
 //!
 //! Visible splats are packed together in the order of their index and sorted by depth (equal depths by index); each
 //! emits the tiles it touches in that order; a stable sort by tile then leaves the list of every tile in depth order. An
-//! *instance* is one (splat, tile) pair, its *slot* its place in the order of emission: the slots of one splat are
+//! *intersection* is one (splat, tile) pair, its *slot* its place in the order of emission: the slots of one splat are
 //! consecutive, so that gradients that were written to slots can be summed splat by splat, in order.
 //!
 //! A splat touches a tile iff the ellipse `opacity exp(-sigma) >= alpha_min` meets the rectangle of the tile's pixel
@@ -10,8 +10,8 @@
 //! unit tries the tiles of one splat; those of a splat over more than 64 tiles are shared out to its workgroup.
 //!
 //! Floor: 28 bytes per splat read and 8 written per visible one; then per visible splat 32 bytes twice (counting and
-//! emitting) and some 40 operations per tile of its bounding box; 12 bytes written per instance, and read again after the
-//! sort.
+//! emitting) and some 40 operations per tile of its bounding box; 12 bytes written per intersection, and read again
+//! after the sort.
 
 mod capacity;
 mod footprint;
@@ -23,8 +23,8 @@ use std::fmt;
 use cubecl::prelude::*;
 use splat_core::TILE_SIDE;
 
-pub use self::capacity::MAX_INSTANCES;
-use self::capacity::{Room, check_instances, max_instances};
+pub use self::capacity::MAX_INTERSECTIONS;
+use self::capacity::{Room, check_intersections, max_intersections};
 pub(crate) use self::footprint::Footprint;
 use self::lists::Counted;
 use crate::floor::{Bytes, Sizes};
@@ -93,20 +93,20 @@ pub(crate) struct Grid {
 /// The lists of all tiles of all cameras.
 #[derive(Clone, Debug)]
 pub struct TileLists {
-    /// Number of instances.
-    pub instances: usize,
-    /// Splat (camera N + Gaussian) of every instance, by tile, front to back; there may be room for more.
+    /// Number of intersections.
+    pub intersections: usize,
+    /// Splat (camera N + Gaussian) of every intersection, by tile, front to back; there may be room for more.
     pub splats: Buffer,
-    /// First instance and end of every tile [tiles, 2].
+    /// First intersection and end of every tile [tiles, 2].
     pub ranges: Buffer,
     /// Only sums in order need them.
     pub slots: Option<Slots>,
 }
 
-/// A slot for every instance, those of one splat side by side.
+/// A slot for every intersection, those of one splat side by side.
 #[derive(Clone, Debug)]
 pub struct Slots {
-    /// Slot of every instance, in the order of the tiles' lists.
+    /// Slot of every intersection, in the order of the tiles' lists.
     pub of: Buffer,
     /// How many splats of a lower index are visible; at the end how many there are, V [splats + 1].
     pub visible: Buffer,
@@ -119,8 +119,8 @@ pub struct Slots {
 /// Why there are no tile lists.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum IntersectError {
-    /// More (splat, tile) pairs than can be indexed, or than a buffer of the device can hold.
-    TooManyInstances {
+    /// More intersections than can be indexed, or than a buffer of the device can hold.
+    TooManyIntersections {
         /// How many there are.
         count: u64,
         /// How many can be listed.
@@ -133,9 +133,9 @@ pub enum IntersectError {
 impl fmt::Display for IntersectError {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
-            Self::TooManyInstances { count, limit } => write!(
+            Self::TooManyIntersections { count, limit } => write!(
                 f,
-                "{count} pairs of a splat and a tile that it touches; at most {limit} can be rendered at once"
+                "{count} intersections of splats and tiles; at most {limit} can be rendered at once"
             ),
             Self::Device(error) => write!(f, "the device failed: {error}"),
         }
@@ -147,16 +147,16 @@ impl std::error::Error for IntersectError {}
 /// Floor of listing for one camera, without the sorts.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     Bytes {
-        read: 28 * sizes.gaussians + 64 * sizes.visible + 12 * sizes.instances,
-        written: 8 * sizes.visible + 12 * sizes.instances,
+        read: 28 * sizes.gaussians + 64 * sizes.visible + 12 * sizes.intersections,
+        written: 8 * sizes.visible + 12 * sizes.intersections,
     }
 }
 
 /// Lists the splats of every tile: `packed` [C, N, 9], `opacities` [C, N]. Waits for the device once, to learn the
-/// number of instances.
+/// number of intersections.
 ///
 /// # Errors
-/// More instances than can be indexed or than a buffer of the device holds, or a failing device.
+/// More intersections than can be indexed or than a buffer of the device holds, or a failing device.
 pub fn intersect(
     client: &Client,
     packed: &Buffer,
@@ -164,12 +164,12 @@ pub fn intersect(
     frames: &Frames,
 ) -> Result<TileLists, IntersectError> {
     let (counted, total) = Counted::new(client, packed, opacities, frames);
-    let instances = wait_for_instances(client, total)?;
-    Ok(counted.list(client, instances))
+    let intersections = wait_for_intersections(client, total)?;
+    Ok(counted.list(client, intersections))
 }
 
 /// Lists the splats of every tile as [`intersect`] does, and hands the lists to `then`, without a pause of the device:
-/// room is made for somewhat more instances than there were lately, and the number is looked at when all is under way.
+/// room is made for somewhat more intersections than there were lately, and the number is looked at when all is under way.
 /// Only if there were more is everything done once more.
 pub(crate) fn intersect_ahead<R>(
     client: &Client,
@@ -179,7 +179,7 @@ pub(crate) fn intersect_ahead<R>(
     then: impl Fn(&TileLists) -> R,
 ) -> Result<(TileLists, R), IntersectError> {
     let (counted, total) = Counted::new(client, packed, opacities, frames);
-    let limit = max_instances(client) as usize;
+    let limit = max_intersections(client) as usize;
     let room = Room::of(client, frames);
     let ahead = room.expected().map(|capacity| {
         let capacity = capacity.min(limit);
@@ -187,24 +187,27 @@ pub(crate) fn intersect_ahead<R>(
         let result = then(&lists);
         (lists, result)
     });
-    let instances = wait_for_instances(client, total)?;
-    room.found(instances);
+    let intersections = wait_for_intersections(client, total)?;
+    room.found(intersections);
     Ok(match ahead {
-        Some((mut lists, result)) if instances <= lists.instances => {
-            lists.instances = instances;
+        Some((mut lists, result)) if intersections <= lists.intersections => {
+            lists.intersections = intersections;
             (lists, result)
         }
         _ => {
-            let lists = counted.list(client, instances);
+            let lists = counted.list(client, intersections);
             let result = then(&lists);
             (lists, result)
         }
     })
 }
 
-fn wait_for_instances(client: &Client, total: PendingTotal<'_>) -> Result<usize, IntersectError> {
+fn wait_for_intersections(
+    client: &Client,
+    total: PendingTotal<'_>,
+) -> Result<usize, IntersectError> {
     let count = total.wait().map_err(IntersectError::Device)?;
-    let instances = check_instances(count, max_instances(client))?;
-    work::listed(instances);
-    Ok(instances)
+    let intersections = check_intersections(count, max_intersections(client))?;
+    work::listed(intersections);
+    Ok(intersections)
 }

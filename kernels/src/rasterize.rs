@@ -11,7 +11,7 @@
 //! ```text
 //! dL/dcolour = T alpha g,   dL/dalpha = T (colour · g) - behind / (1 - alpha)     (0 at the cap)
 //! ```
-//! Gradients of one (tile, splat) pair are summed over the tile's pixels in fixed order. By default each pair writes to
+//! Gradients of one intersection are summed over the tile's pixels in fixed order. By default each writes to
 //! its own slot, and then the slots of every splat are summed in order: the same bits every time. [`Sums`] has the other
 //! way, without slots.
 //!
@@ -44,7 +44,8 @@ use crate::math::is_finite;
 /// Most channels of one launch; fewer where a unit has many pixels.
 pub const MAX_CHANNELS: usize = 32;
 
-/// Gradients of one instance that a 32-bit index reaches however many instances there are; more of them only of fewer.
+/// Gradients of one intersection that a 32-bit index reaches however many intersections there are; more of them only
+/// of fewer.
 pub const MAX_SLOT_VALUES: usize = SHAPE_GRADIENTS + MAX_CHANNELS / 2;
 
 /// Thresholds of the blending, and how its gradients are summed.
@@ -138,7 +139,7 @@ fn without_broken_colors(client: &Client, inputs: &RasterizeInputs, frames: &Fra
 
 /// Renders all cameras: the image with alpha as its last channel [C, H, W, D + 1], and what the backward pass needs.
 /// Waits once until the
-/// number of instances is known, while the device goes on.
+/// number of intersections is known, while the device goes on.
 ///
 /// # Errors
 /// Those of [`crate::intersect::intersect`].
@@ -209,8 +210,8 @@ fn blend(
 
 /// Floors of forward and gradient for one camera, with lists that are there; the gradient summed in order.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
-    let (i, pixels, color) = (sizes.instances, sizes.pixels(), 4 * sizes.channels);
-    // In the gradient: its sums per instance, written and read again, and what becomes of them per Gaussian.
+    let (i, pixels, color) = (sizes.intersections, sizes.pixels(), 4 * sizes.channels);
+    // In the gradient: its sums per intersection, written and read again, and what becomes of them per Gaussian.
     let sums = (24 + color) * i;
     let packed_and_opacity = 4 * (PROJECTED_WIDTH as u64 + 1);
     [

@@ -270,12 +270,13 @@ pub fn variant(client: &Client) -> String {
     format!("{} bits a pass, ranks from {ranks}", ranking.digit_bits())
 }
 
-/// Floor of the two sorts of a view: the visible splats by depth, then the instances by tile.
+/// Floor of the two sorts of a view: the visible splats by depth, then the intersections by tile.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     let tile = u64::from(TILE);
     let tiles = sizes.width.div_ceil(tile) * sizes.height.div_ceil(tile);
     let passes = |bits: u32| u64::from(bits.div_ceil(sizes.digit_bits.max(1)));
-    let pairs = sizes.visible * passes(32) + sizes.instances * passes(bits_for(tiles as usize + 1));
+    let pairs =
+        sizes.visible * passes(32) + sizes.intersections * passes(bits_for(tiles as usize + 1));
     Bytes {
         read: 12 * pairs,
         written: 8 * pairs,

@@ -29,7 +29,7 @@ fn launches_bytes_and_waits_are_counted() {
         launches: 3,
         reserved_bytes: 4 * (5000 + 3 + 3 + 1),
         waits: 1,
-        instances: 0,
+        intersections: 0,
     };
     assert_eq!(work().since(before), expected);
 }
@@ -64,12 +64,12 @@ fn render(client: &Client, splats: usize, spread: f32) -> (Vec<f32>, Work) {
     let before = work();
     let (image, state) = rasterize(client, &inputs, &frames, &settings).unwrap();
     let done = work().since(before);
-    assert_eq!(done.instances, state.lists.instances as u64);
+    assert_eq!(done.intersections, state.lists.intersections as u64);
     (image.read_f32(client).unwrap(), done)
 }
 
 #[test]
-fn more_instances_than_there_was_room_for_are_listed_again() {
+fn more_intersections_than_there_was_room_for_are_listed_again() {
     let Some((_guard, client)) = alone() else {
         return;
     };
@@ -77,7 +77,7 @@ fn more_instances_than_there_was_room_for_are_listed_again() {
     let (first, again) = render(&client, 200, 0.05);
     let (second, at_once) = render(&client, 200, 0.05);
     println!("{few:?}\n{again:?}\n{at_once:?}");
-    assert!(again.instances > 3 * few.instances);
+    assert!(again.intersections > 3 * few.intersections);
     assert!(again.launches > at_once.launches, "nothing was done again");
     // What was tried with too little room left no trace, and room to spare makes no difference.
     assert_eq!(first, second);

@@ -54,8 +54,8 @@ pub struct RasterizeSettings {
     pub transmittance_min: f64,
     /// Whether the same input gives the same gradients, bit for bit, every time. Default true. False, on a CubeCL device:
     /// the tiles' shares of a splat's gradient are added up as they come, which differs from run to run in the last digits.
-    /// It saves memory, 24 bytes and 4 per channel of each (splat, tile) pair in the backward pass, and from the forward
-    /// pass on 4 of each pair and 12 of each Gaussian and camera; docs/GPU.md has what it does to the time. The CPU sums
+    /// It saves memory, 24 bytes and 4 per channel of each intersection in the backward pass, and from the forward
+    /// pass on 4 of each and 12 of each Gaussian and camera; docs/GPU.md has what it does to the time. The CPU sums
     /// in order in any case.
     pub deterministic: bool,
 }

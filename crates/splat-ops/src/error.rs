@@ -41,27 +41,27 @@ pub enum OpError {
     },
     /// The splats touch more tiles than one call can list.
     #[error(
-        "{op}: {pairs} pairs of a tile and a splat that touches it; one call can list {limit}. \
+        "{op}: {intersections} intersections of a splat and a tile; one call can list {limit}. \
          Render fewer cameras or a smaller image per call, or remove Gaussians: huge ones first"
     )]
-    TooManyPairs {
+    TooManyIntersections {
         /// The op.
         op: &'static str,
-        /// Pairs of a tile and a splat that touches it.
-        pairs: u64,
+        /// Intersections of a splat and a tile.
+        intersections: u64,
         /// How many of them can be listed.
         limit: u64,
     },
     /// The lists of splats by tile need more memory than this process can get.
     #[error(
-        "{op}: {pairs} pairs of a tile and a splat that touches it need {needed} of memory, and {left} can be had. \
+        "{op}: {intersections} intersections of a splat and a tile need {needed} of memory, and {left} can be had. \
          Render a smaller image, fewer cameras per call, or remove Gaussians: huge ones first"
     )]
     OutOfMemory {
         /// The op.
         op: &'static str,
-        /// Pairs of a tile and a splat that touches it.
-        pairs: u64,
+        /// Intersections of a splat and a tile.
+        intersections: u64,
         /// Memory needed, in words.
         needed: String,
         /// Memory left, in words.

@@ -56,7 +56,7 @@ impl Rendered {
 ///
 /// # Errors
 /// When shapes, types or devices do not fit, when a setting is out of range, when the splats touch more tiles than one call
-/// can list ([`OpError::TooManyPairs`]), and when the device fails.
+/// can list ([`OpError::TooManyIntersections`]), and when the device fails.
 pub fn rasterize<const DC: usize, const DO: usize>(
     projected: &Projected,
     colors: Tensor<DC>,

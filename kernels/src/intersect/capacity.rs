@@ -9,21 +9,21 @@ use cubecl::prelude::*;
 use super::{Frames, IntersectError};
 use crate::rasterize::MAX_SLOT_VALUES;
 
-/// Instances that can be listed: kernels address memory by 32-bit indices, and the backward pass keeps up to
-/// [`MAX_SLOT_VALUES`] floats per instance.
-pub const MAX_INSTANCES: u64 = u32::MAX as u64 / MAX_SLOT_VALUES as u64;
+/// Intersections that can be listed: kernels address memory by 32-bit indices, and the backward pass keeps up to
+/// [`MAX_SLOT_VALUES`] floats per intersection.
+pub const MAX_INTERSECTIONS: u64 = u32::MAX as u64 / MAX_SLOT_VALUES as u64;
 
-/// Instances that a device can list: each is one number in each of several buffers, whose size the device limits.
-pub(super) fn max_instances(client: &Client) -> u64 {
+/// Intersections that a device can list: each is one number in each of several buffers, whose size the device limits.
+pub(super) fn max_intersections(client: &Client) -> u64 {
     let largest_buffer = client.properties().memory.max_page_size;
-    MAX_INSTANCES.min(largest_buffer / size_of::<u32>() as u64)
+    MAX_INTERSECTIONS.min(largest_buffer / size_of::<u32>() as u64)
 }
 
-/// The one place that decides how many instances are too many. Asked before any list is allocated.
-pub(super) fn check_instances(count: u64, limit: u64) -> Result<usize, IntersectError> {
+/// The one place that decides how many intersections are too many. Asked before any list is allocated.
+pub(super) fn check_intersections(count: u64, limit: u64) -> Result<usize, IntersectError> {
     match usize::try_from(count) {
-        Ok(instances) if count <= limit => Ok(instances),
-        _ => Err(IntersectError::TooManyInstances { count, limit }),
+        Ok(intersections) if count <= limit => Ok(intersections),
+        _ => Err(IntersectError::TooManyIntersections { count, limit }),
     }
 }
 
@@ -53,13 +53,13 @@ impl Room {
     /// Somewhat more than lately; `None` before the first call.
     pub(super) fn expected(&self) -> Option<usize> {
         let lately = *Self::lately().get(&self.key)?;
-        (lately > 0).then(|| (lately + lately / 4).min(MAX_INSTANCES as usize))
+        (lately > 0).then(|| (lately + lately / 4).min(MAX_INTERSECTIONS as usize))
     }
 
-    pub(super) fn found(&self, instances: usize) {
+    pub(super) fn found(&self, intersections: usize) {
         let mut all = Self::lately();
         let lately = all.entry(self.key).or_default();
-        *lately = instances.max(*lately - *lately / 16);
+        *lately = intersections.max(*lately - *lately / 16);
     }
 }
 
@@ -68,15 +68,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn instances_are_refused_from_the_first_one_whose_gradients_cannot_be_indexed() {
-        for instances in [0, 1, MAX_INSTANCES] {
-            let count = check_instances(instances, MAX_INSTANCES);
-            assert_eq!(count, Ok(instances as usize));
-            assert!(instances * MAX_SLOT_VALUES as u64 <= u64::from(u32::MAX));
+    fn intersections_are_refused_from_the_first_one_whose_gradients_cannot_be_indexed() {
+        for intersections in [0, 1, MAX_INTERSECTIONS] {
+            let count = check_intersections(intersections, MAX_INTERSECTIONS);
+            assert_eq!(count, Ok(intersections as usize));
+            assert!(intersections * MAX_SLOT_VALUES as u64 <= u64::from(u32::MAX));
         }
-        for instances in [MAX_INSTANCES + 1, 1 << 31, 1 << 32, (1 << 32) + 5, u64::MAX] {
-            let error = check_instances(instances, MAX_INSTANCES).unwrap_err();
-            assert!(error.to_string().contains(&instances.to_string()));
+        for intersections in [
+            MAX_INTERSECTIONS + 1,
+            1 << 31,
+            1 << 32,
+            (1 << 32) + 5,
+            u64::MAX,
+        ] {
+            let error = check_intersections(intersections, MAX_INTERSECTIONS).unwrap_err();
+            assert!(error.to_string().contains(&intersections.to_string()));
         }
     }
 }

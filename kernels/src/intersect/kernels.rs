@@ -45,9 +45,9 @@ pub(super) fn pack_visible(
     }
 }
 
-/// An instance in its slot, unless the slot is another splat's.
+/// An intersection in its slot, unless the slot is another splat's.
 #[cube]
-fn emit_instance(
+fn emit_intersection(
     keys: &mut [u32],
     slots: &mut [u32],
     slot_splats: &mut [u32],
@@ -77,7 +77,7 @@ fn emit_nothing(
 ) {
     let mut slot = slot;
     while slot < end {
-        emit_instance(keys, slots, slot_splats, slot, end, grid.tiles, splat);
+        emit_intersection(keys, slots, slot_splats, slot, end, grid.tiles, splat);
         slot += 1u32;
     }
 }
@@ -109,7 +109,7 @@ fn walk_narrow(
         if touched {
             if comptime!(emit) {
                 let tile = first_tile + tile;
-                emit_instance(keys, slots, slot_splats, slot, end, tile, splat);
+                emit_intersection(keys, slots, slot_splats, slot, end, tile, splat);
             }
             slot += 1u32;
         }
@@ -154,7 +154,7 @@ fn walk_wide(
             let (before, total) = cube_exclusive_sum(one, shared, CUBE_UNITS_USIZE);
             if touched {
                 let (slot, tile) = (slot + before, first_tile + tile);
-                emit_instance(keys, slots, slot_splats, slot, end, tile, splat);
+                emit_intersection(keys, slots, slot_splats, slot, end, tile, splat);
             }
             slot += total;
         } else {
@@ -275,13 +275,13 @@ fn lower_bound(keys: &[u32], len: u32, key: u32) -> u32 {
     low
 }
 
-/// Instances, of which the device knows `counted[at]` and there is room for `capacity`.
+/// Intersections, of which the device knows `counted[at]` and there is room for `capacity`.
 #[cube]
-fn instances_listed(counted: &[u32], at: u32, capacity: u32) -> u32 {
+fn intersections_listed(counted: &[u32], at: u32, capacity: u32) -> u32 {
     min(counted[at as usize], capacity)
 }
 
-/// Range of instances of every tile, empty ones too.
+/// Range of intersections of every tile, empty ones too.
 #[cube(launch)]
 pub(super) fn tile_ranges(
     keys: &[u32],
@@ -293,13 +293,13 @@ pub(super) fn tile_ranges(
 ) {
     let tile = ABSOLUTE_POS;
     if tile < tiles as usize {
-        let instances = instances_listed(counted, at, capacity);
-        ranges[tile * 2] = lower_bound(keys, instances, tile as u32);
-        ranges[tile * 2 + 1] = lower_bound(keys, instances, tile as u32 + 1u32);
+        let intersections = intersections_listed(counted, at, capacity);
+        ranges[tile * 2] = lower_bound(keys, intersections, tile as u32);
+        ranges[tile * 2 + 1] = lower_bound(keys, intersections, tile as u32 + 1u32);
     }
 }
 
-/// `out[i] = table[indices[i]]` for every instance.
+/// `out[i] = table[indices[i]]` for every intersection.
 #[cube(launch)]
 pub(super) fn gather(
     indices: &[u32],
@@ -309,7 +309,7 @@ pub(super) fn gather(
     at: u32,
     capacity: u32,
 ) {
-    if ABSOLUTE_POS < instances_listed(counted, at, capacity) as usize {
+    if ABSOLUTE_POS < intersections_listed(counted, at, capacity) as usize {
         out[ABSOLUTE_POS] = table[indices[ABSOLUTE_POS] as usize];
     }
 }

@@ -8,7 +8,7 @@ use crate::launch::{Buffer, per_element};
 use crate::scan::{PendingTotal, exclusive_sum, exclusive_sum_with_total};
 use crate::sort::{bits_for, sort_first_pairs};
 
-/// The visible splats in order, and where their slots begin: all that is known before there is memory for instances.
+/// The visible splats in order, and where their slots begin: all that is known before there is memory for intersections.
 pub(super) struct Counted<'a> {
     packed: &'a Buffer,
     opacities: &'a Buffer,
@@ -70,7 +70,7 @@ impl<'a> Counted<'a> {
         (counted, total)
     }
 
-    /// Counts the tiles of every splat, or emits keys, slots and splats of the instances.
+    /// Counts the tiles of every splat, or emits keys, slots and splats of the intersections.
     fn walk(&self, client: &Client, out: [&Buffer; 3], capacity: usize, emit: bool) {
         let [keys, slots, slot_splats] = out;
         if let Some((count, dim)) = per_element(self.frames.splats() + 1) {
@@ -93,7 +93,7 @@ impl<'a> Counted<'a> {
         }
     }
 
-    /// The lists, if there are at most `capacity` instances; `instances` is that capacity.
+    /// The lists, if there are at most `capacity` intersections; `intersections` is that capacity.
     pub(super) fn list(&self, client: &Client, capacity: usize) -> TileLists {
         let tiles = self.frames.tiles();
         let at = self.frames.splats() as u32;
@@ -134,7 +134,7 @@ impl<'a> Counted<'a> {
             );
         }
         TileLists {
-            instances: capacity,
+            intersections: capacity,
             splats: tile_splats,
             ranges,
             slots: Some(Slots {

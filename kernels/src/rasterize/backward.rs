@@ -1,15 +1,15 @@
-//! The gradient of every (tile, splat) pair, back to front; `sums.rs` has what becomes of it.
+//! The gradient of every intersection, back to front; `sums.rs` has what becomes of it.
 //!
 //! With g = dL/dsigma of one pixel, all gradients of a splat's shape follow from six sums over pixels:
 //! ```text
 //! A = Σ g,  B = Σ g z1,  C = Σ g z2,  D = Σ g z1 dx,  E = Σ g z2 dx,  F = Σ g z2 dy
 //! dL/dw11 = D,  dL/dw21 = E,  dL/dw22 = F,  dL/dmean = -(w11 B + w21 C, w22 C),  dL/do = -A / o
 //! ```
-//! Each block sums its pixels, and the tile its blocks (in order). One value of a pair goes to its slot, or is added to
-//! the splat's gradient at once.
+//! Each block sums its pixels, and the tile its blocks (in order). One value of an intersection goes to its slot, or
+//! is added to the splat's gradient at once.
 //!
 //! Floor per (block, splat) pair: as forward, plus 24 bytes and 4 per channel to shared memory; per pixel of the block
-//! about 45 operations and 4 per channel. Per (tile, splat) pair: 32 bytes and 4 per channel from memory (28 without
+//! about 45 operations and 4 per channel. Per intersection: 32 bytes and 4 per channel from memory (28 without
 //! slots), and what `sums.rs` counts.
 
 use cubecl::prelude::*;
@@ -47,7 +47,8 @@ impl SlotLayout {
         if self.shape { SHAPE_GRADIENTS } else { 0 }
     }
 
-    /// Floats in shared memory beside the partial sums: the batch, its targets and bits, and how far the blocks have walked.
+    /// Floats in shared memory beside the partial sums: the batch, its targets and bits, and how far the blocks have
+    /// walked.
     fn batch(self, plan: Plan) -> usize {
         BATCH * (SHAPE + self.width) + 2 * BATCH + plan.blocks() * (WORDS + 1) + 2
     }
@@ -376,7 +377,7 @@ fn sum_group<A: Numeric>(
     }
 }
 
-/// Gradients of every (tile, splat) pair: one workgroup per tile, back to front. They go to `target`, to splats as `sums`
+/// Gradients of every intersection: one workgroup per tile, back to front. They go to `target`, to splats as `sums`
 /// says.
 // Longer than a hundred lines by its arguments and those of the steps that it calls.
 #[cube(launch)]

@@ -1,7 +1,7 @@
 //! Blending of a tile, front to back.
 //!
 //! Floor per (block, splat) pair: 24 bytes of shape and 4 per channel from shared memory; per pixel of the block about
-//! 30 operations and 2 per channel. Per (tile, splat) pair: 28 bytes and 4 per channel from memory; per pixel 12 bytes
+//! 30 operations and 2 per channel. Per intersection: 28 bytes and 4 per channel from memory; per pixel 12 bytes
 //! and 4 per channel to memory.
 
 use cubecl::prelude::*;

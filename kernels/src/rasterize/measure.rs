@@ -25,17 +25,17 @@ impl Kept {
         }
     }
 
-    /// Splat, and for sums in order the slot, of all instances that there was room for: up to a quarter more than there
+    /// Splat, and for sums in order the slot, of all intersections that there was room for: up to a quarter more than there
     /// are.
-    pub const fn per_instance(sums: Sums) -> u64 {
+    pub const fn per_intersection(sums: Sums) -> u64 {
         match sums {
             Sums::Ordered => 8,
             Sums::Atomic | Sums::Exchange => 4,
         }
     }
 
-    /// Bytes per instance that the gradient takes while it is made.
-    pub const fn gradient_per_instance(channels: u64, sums: Sums) -> u64 {
+    /// Bytes per intersection that the gradient takes while it is made.
+    pub const fn gradient_per_intersection(channels: u64, sums: Sums) -> u64 {
         match sums {
             Sums::Ordered => 4 * (SHAPE_GRADIENTS as u64 + channels),
             Sums::Atomic | Sums::Exchange => 0,

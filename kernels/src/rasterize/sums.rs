@@ -1,10 +1,10 @@
 //! How the gradients of a splat's tiles become the splat's: in order, or as they come.
 //!
-//! In order, each (tile, splat) pair writes to its own slot, and then the slots of every splat are summed: the same bits
+//! In order, each intersection writes to its own slot, and then the slots of every splat are summed: the same bits
 //! every time. As they come, they are added to the splat's gradient by atomic additions, whose order differs from run to
 //! run: no slots, and nothing to be read again.
 //!
-//! Floor per (tile, splat) pair: in order 24 bytes and 4 per channel to memory, and once more from it; as they come 6
+//! Floor per intersection: in order 24 bytes and 4 per channel to memory, and once more from it; as they come 6
 //! additions and 1 per channel in memory.
 
 use cubecl::client::Client;
@@ -49,7 +49,7 @@ pub(super) enum Target<A: Numeric> {
     Splats(SplatTarget<A>),
 }
 
-/// The slot of every (tile, splat) pair, and the gradients of all slots.
+/// The slot of every intersection, and the gradients of all slots.
 #[derive(CubeType, CubeLaunch)]
 pub(super) struct SlotTarget {
     pub of: Box<[u32]>,

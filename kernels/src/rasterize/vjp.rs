@@ -12,11 +12,11 @@ use super::{RasterizeInputs, RasterizeSettings, RasterizeState, Sums};
 use crate::intersect::{Frames, Slots};
 use crate::launch::{Buffer, cube_count, per_element};
 
-/// Most channels of one launch of the backward pass, of `most` that it could do: the slots of all instances must fit into
+/// Most channels of one launch of the backward pass, of `most` that it could do: the slots of all intersections must fit into
 /// a buffer of `bytes`, and within reach of an index.
-fn slot_channels(most: usize, bytes: u64, instances: usize) -> usize {
+fn slot_channels(most: usize, bytes: u64, intersections: usize) -> usize {
     let floats = (bytes / 4).min(u64::from(u32::MAX));
-    let values = (floats / instances.max(1) as u64) as usize;
+    let values = (floats / intersections.max(1) as u64) as usize;
     values.saturating_sub(SHAPE_GRADIENTS).clamp(1, most)
 }
 
@@ -70,7 +70,7 @@ pub fn rasterize_vjp(
         let plan = Plan::new(client);
         let page = client.properties().memory.max_page_size;
         let width = match sums {
-            Sums::Ordered => slot_channels(plan.channels(), page, lists.instances),
+            Sums::Ordered => slot_channels(plan.channels(), page, lists.intersections),
             Sums::Atomic | Sums::Exchange => plan.channels(),
         };
         for first_channel in (0..channels).step_by(width) {
@@ -126,7 +126,7 @@ impl Launch<'_> {
         let [grad_packed, grad_colors, grad_opacities] = gradients;
         let splats = self.frames.splats();
         let values = self.layout.values();
-        let slot_gradients = zeros(self.client, self.state.lists.instances * values);
+        let slot_gradients = zeros(self.client, self.state.lists.intersections * values);
         let target = SlotTargetLaunch::new(slots.of.arg(), slot_gradients.arg());
         self.tiles::<u32>(Sums::Ordered, TargetArgs::Slots(target));
         if let Some((count, dim)) = per_element(splats * values) {
@@ -159,7 +159,7 @@ impl Launch<'_> {
 
     fn tiles<A: Numeric>(&self, sums: Sums, target: TargetArgs<A>) {
         let (inputs, state, frames) = (self.inputs, self.state, self.frames);
-        if state.lists.instances == 0 {
+        if state.lists.intersections == 0 {
             return;
         }
         rasterize_backward::launch::<A>(
@@ -191,19 +191,19 @@ impl Launch<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::intersect::MAX_INSTANCES;
+    use crate::intersect::MAX_INTERSECTIONS;
 
     #[test]
-    fn the_more_instances_the_fewer_channels_at_once() {
+    fn the_more_intersections_the_fewer_channels_at_once() {
         assert_eq!(slot_channels(32, 1 << 40, 0), 32);
         assert_eq!(slot_channels(32, 1 << 40, 1_000_000), 32);
-        assert_eq!(slot_channels(32, 1 << 40, MAX_INSTANCES as usize), 16);
-        // 128 MiB: 33 floats for each of a million instances, 3 for each of eleven million.
+        assert_eq!(slot_channels(32, 1 << 40, MAX_INTERSECTIONS as usize), 16);
+        // 128 MiB: 33 floats for each of a million intersections, 3 for each of eleven million.
         assert_eq!(slot_channels(32, 1 << 27, 1_000_000), 27);
         assert_eq!(slot_channels(32, 1 << 27, 11_000_000), 1);
-        for instances in [1, 1000, 1 << 20, MAX_INSTANCES] {
-            let values = SHAPE_GRADIENTS + slot_channels(32, 1 << 40, instances as usize);
-            assert!(instances * values as u64 <= u64::from(u32::MAX));
+        for intersections in [1, 1000, 1 << 20, MAX_INTERSECTIONS] {
+            let values = SHAPE_GRADIENTS + slot_channels(32, 1 << 40, intersections as usize);
+            assert!(intersections * values as u64 <= u64::from(u32::MAX));
         }
     }
 }

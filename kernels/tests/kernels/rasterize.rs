@@ -399,7 +399,7 @@ fn sums_of_thousands_of_tiles_lose_nothing() {
     let [ordered, atomic, exchange] = ALL_SUMS.map(|sums| {
         let settings = RasterizeSettings { sums, ..SETTINGS };
         let (_, state) = rasterize(&client, &inputs, &scene.frames, &settings).unwrap();
-        assert_eq!(state.lists.instances, 3 * 64 * 64);
+        assert_eq!(state.lists.intersections, 3 * 64 * 64);
         assert_eq!(state.lists.slots.is_some(), sums == Sums::Ordered);
         let [packed, colors, ..]: [_; 4] = rasterize_vjp(
             &client,
@@ -565,7 +565,7 @@ fn time_of_the_stages_at_270_by_480() {
         .into();
         download(&client, grads[2].as_ref().unwrap());
         lap("backward");
-        println!("{} instances", lists.instances);
+        println!("{} intersections", lists.intersections);
         if round == 3 {
             let count =
                 count_evaluations(&client, &inputs, &state, &scene.frames, &SETTINGS).unwrap();

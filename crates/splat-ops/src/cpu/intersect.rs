@@ -26,50 +26,50 @@ use splat_core::memory::{in_units, lacking};
 /// Gaussians per unit of the search for those that are seen.
 const SEARCHED: usize = 2048;
 
-/// Pairs of a tile and a splat of one camera that can be listed: they are counted in 32 bits.
-const MAX_PAIRS: u64 = u32::MAX as u64;
+/// Intersections of one camera that can be listed: they are counted in 32 bits.
+const MAX_INTERSECTIONS: u64 = u32::MAX as u64;
 
-/// The one place that decides how many pairs are too many. Asked before any list is allocated.
-fn check_pairs(pairs: u64, limit: u64) -> Result<(), OpError> {
-    if pairs <= limit {
+/// The one place that decides how many intersections are too many. Asked before any list is allocated.
+fn check_intersections(intersections: u64, limit: u64) -> Result<(), OpError> {
+    if intersections <= limit {
         return Ok(());
     }
-    Err(OpError::TooManyPairs {
+    Err(OpError::TooManyIntersections {
         op: "rasterize",
-        pairs,
+        intersections,
         limit,
     })
 }
 
-/// Refuses pairs that memory could not hold: the allocation that failed would end the process.
-fn check_memory(pairs: u64, bytes_per_pair: u64) -> Result<(), OpError> {
-    let needed = pairs.saturating_mul(bytes_per_pair);
+/// Refuses intersections that memory could not hold: the allocation that failed would end the process.
+fn check_memory(intersections: u64, bytes_per_intersection: u64) -> Result<(), OpError> {
+    let needed = intersections.saturating_mul(bytes_per_intersection);
     match lacking(needed) {
         None => Ok(()),
         Some(left) => Err(OpError::OutOfMemory {
             op: "rasterize",
-            pairs,
+            intersections,
             needed: in_units(needed),
             left: in_units(left),
         }),
     }
 }
 
-/// Bytes that a pair takes at most at any one time: while the lists are made, or then with the bytes `kept` of it.
-fn bytes_per_pair(kept: usize) -> u64 {
-    // Tiles of the emission, whose vectors grow by doubling; owners, instances, splats and places.
+/// Bytes that an intersection takes at most at any one time: while the lists are made, or then with the bytes `kept` of it.
+fn bytes_per_intersection(kept: usize) -> u64 {
+    // Tiles of the emission, whose vectors grow by doubling; owners, intersections, splats and places.
     let while_listed = (2 + 4) * size_of::<u32>();
     let listed = 2 * size_of::<u32>();
     while_listed.max(listed + kept) as u64
 }
 
 #[cfg(not(test))]
-fn max_pairs() -> u64 {
-    MAX_PAIRS
+fn max_intersections() -> u64 {
+    MAX_INTERSECTIONS
 }
 
 #[cfg(test)]
-use tests::max_pairs;
+use tests::max_intersections;
 
 /// The Gaussians among some that can be seen anywhere: not culled, not too faint, and no NaN decides it. One with a colour
 /// that is not finite is left out too: it would be in every pixel it touches.
@@ -97,24 +97,24 @@ fn visible<T: Real>(
     visible
 }
 
-/// The lists of one camera. An instance is one (splat, tile) pair.
+/// The lists of one camera. An intersection is a splat and a tile that it touches.
 #[derive(Debug)]
 pub(super) struct TileLists {
     /// The Gaussian of each listed splat, ascending.
     pub(super) listed: Vec<u32>,
-    /// The emitted instances of each listed splat end here.
+    /// The emitted intersections of each listed splat end here.
     ends: Vec<u32>,
-    /// Where each emitted instance went when they were sorted by tile and depth.
+    /// Where each emitted intersection went when they were sorted by tile and depth.
     places: Vec<AtomicU32>,
-    /// The listed splat of each instance, sorted by tile, front to back in each tile.
+    /// The listed splat of each intersection, sorted by tile, front to back in each tile.
     splats: Vec<u32>,
-    /// `tiles[t]..tiles[t + 1]`: the sorted instances of tile t, tiles in rows.
+    /// `tiles[t]..tiles[t + 1]`: the sorted intersections of tile t, tiles in rows.
     tiles: Vec<u32>,
 }
 
 impl TileLists {
     /// Lists for one camera, and its listed splats: packed splats `[N, 9]`, colours `[N, D]` and opacities `[N]`. Of each
-    /// pair the caller keeps `kept` bytes.
+    /// intersection the caller keeps `kept` bytes.
     pub(super) fn new<T: Real>(
         [packed, colors, opacities]: [&[T]; 3],
         args: &RasterizeArgs,
@@ -147,13 +147,13 @@ impl TileLists {
                 .collect()
         };
         // Where there may be too many they are counted before any is kept.
-        let limit = max_pairs();
-        let each = bytes_per_pair(kept);
+        let limit = max_intersections();
+        let each = bytes_per_intersection(kept);
         let most = listed.len() as u64 * grid.tiles() as u64;
         if most > limit || lacking(most.saturating_mul(each)).is_some() {
-            let pairs = emitted(false).iter().map(|part| part.pairs).sum();
-            check_pairs(pairs, limit)?;
-            check_memory(pairs, each)?;
+            let intersections = emitted(false).iter().map(|part| part.intersections).sum();
+            check_intersections(intersections, limit)?;
+            check_memory(intersections, each)?;
         }
         let emitted = emitted(true);
 
@@ -161,8 +161,8 @@ impl TileLists {
         Ok((lists, splats.written()))
     }
 
-    /// Number of (splat, tile) pairs.
-    pub(super) fn instances(&self) -> usize {
+    /// Number of intersections.
+    pub(super) fn intersections(&self) -> usize {
         self.splats.len()
     }
 
@@ -171,20 +171,20 @@ impl TileLists {
         &self.splats[self.tiles[tile] as usize..self.tiles[tile + 1] as usize]
     }
 
-    /// The sorted instances of a row of tiles.
+    /// The sorted intersections of a row of tiles.
     pub(super) fn row_of_tiles(&self, ty: usize, grid: Grid) -> Range<usize> {
         let [first, last] = [ty, ty + 1].map(|row| self.tiles[row * grid.columns] as usize);
         first..last
     }
 
-    /// The emitted instances of a listed splat.
+    /// The emitted intersections of a listed splat.
     #[inline(always)]
     pub(super) fn emitted(&self, splat: usize) -> Range<usize> {
         let first = splat.checked_sub(1).map_or(0, |before| self.ends[before]);
         first as usize..self.ends[splat] as usize
     }
 
-    /// Where an emitted instance went, if there is one of that number.
+    /// Where an emitted intersection went, if there is one of that number.
     #[inline(always)]
     pub(super) fn place(&self, emitted: usize) -> Option<usize> {
         let place = self.places.get(emitted)?;
@@ -204,11 +204,11 @@ mod tests {
     use burn::tensor::{Device, Tensor, TensorData};
 
     thread_local! {
-        /// A test on this thread may lower the limit: no test can list 2^32 pairs.
-        static LIMIT: Cell<u64> = const { Cell::new(MAX_PAIRS) };
+        /// A test on this thread may lower the limit: no test can list 2^32 intersections.
+        static LIMIT: Cell<u64> = const { Cell::new(MAX_INTERSECTIONS) };
     }
 
-    pub(super) fn max_pairs() -> u64 {
+    pub(super) fn max_intersections() -> u64 {
         LIMIT.get()
     }
 
@@ -225,14 +225,17 @@ mod tests {
     }
 
     #[test]
-    fn pairs_are_refused_from_the_first_one_that_cannot_be_indexed() {
-        for pairs in [0, 1, 1 << 31, MAX_PAIRS] {
-            assert_eq!(check_pairs(pairs, MAX_PAIRS), Ok(()));
+    fn intersections_are_refused_from_the_first_one_that_cannot_be_indexed() {
+        for intersections in [0, 1, 1 << 31, MAX_INTERSECTIONS] {
+            assert_eq!(
+                check_intersections(intersections, MAX_INTERSECTIONS),
+                Ok(())
+            );
         }
-        for pairs in [1 << 32, (1 << 32) + 5, 1 << 40, u64::MAX] {
-            let error = check_pairs(pairs, MAX_PAIRS).unwrap_err();
+        for intersections in [1 << 32, (1 << 32) + 5, 1 << 40, u64::MAX] {
+            let error = check_intersections(intersections, MAX_INTERSECTIONS).unwrap_err();
             let message = error.to_string();
-            assert!(message.contains(&pairs.to_string()), "{message}");
+            assert!(message.contains(&intersections.to_string()), "{message}");
             assert!(message.contains("4294967295"), "{message}");
         }
     }
@@ -293,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
+    fn too_many_intersections_are_an_error_of_the_op_and_not_a_panic() {
         for tracked in [false, true] {
             let device = Device::flex();
             let device = if tracked { device.autodiff() } else { device };
@@ -311,24 +314,29 @@ mod tests {
                     None,
                     &settings,
                 );
-                LIMIT.set(MAX_PAIRS);
+                LIMIT.set(MAX_INTERSECTIONS);
                 rendered
             };
-            let pairs = match render(0) {
-                Err(OpError::TooManyPairs {
-                    pairs, limit: 0, ..
-                }) => pairs,
+            let intersections = match render(0) {
+                Err(OpError::TooManyIntersections {
+                    intersections,
+                    limit: 0,
+                    ..
+                }) => intersections,
                 other => panic!("{other:?}"),
             };
             // Fewer than the nine tiles of the bounding box: what counts is what would be listed.
-            assert!((3..9).contains(&pairs), "{pairs} pairs");
-            assert!(render(pairs).is_ok());
+            assert!(
+                (3..9).contains(&intersections),
+                "{intersections} intersections"
+            );
+            assert!(render(intersections).is_ok());
             assert_eq!(
-                render(pairs - 1).unwrap_err(),
-                OpError::TooManyPairs {
+                render(intersections - 1).unwrap_err(),
+                OpError::TooManyIntersections {
                     op: "rasterize",
-                    pairs,
-                    limit: pairs - 1
+                    intersections,
+                    limit: intersections - 1
                 }
             );
         }
@@ -346,7 +354,7 @@ mod tests {
         });
         LIMIT.set(0);
         let (image, state) = Flex::rasterize_tracked(inputs.clone(), &args);
-        LIMIT.set(MAX_PAIRS);
+        LIMIT.set(MAX_INTERSECTIONS);
         assert!(args.errors.error().is_some());
         assert_eq!(image.as_slice::<f32>(), Some(&[0.0; 12][..]));
 

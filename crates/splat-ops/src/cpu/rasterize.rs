@@ -147,13 +147,13 @@ fn backward<T: Real>(
         let background = Camera::<T>::new(&buffers, index).background;
         let view = View::new(&frame.listed, background, args);
         let grad = &grad[index * pixels..(index + 1) * pixels];
-        // Every (tile, splat) pair writes its own row; each splat then sums its rows in order.
+        // Every intersection writes its own row; each splat then sums its rows in order.
         let width = MOMENTS + d;
-        let mut partials = Uncleared::<T>::new(view.lists.instances() * width);
-        let of_row = |ty: usize| view.instances_of_row(ty) * width;
+        let mut partials = Uncleared::<T>::new(view.lists.intersections() * width);
+        let of_row = |ty: usize| view.intersections_of_row(ty) * width;
         let backgrounds = heaviest_first(
             partials.parts((0..view.grid.rows).map(of_row)),
-            |ty| view.instances_of_row(ty),
+            |ty| view.intersections_of_row(ty),
             |ty, partials| {
                 let row = RowOfTilesBackward {
                     view: &view,

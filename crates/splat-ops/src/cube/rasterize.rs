@@ -47,9 +47,9 @@ fn inputs(tensors: &Prepared) -> RasterizeInputs {
 fn op_error(error: IntersectError) -> OpError {
     let op = "rasterize";
     match error {
-        IntersectError::TooManyInstances { count, limit } => OpError::TooManyPairs {
+        IntersectError::TooManyIntersections { count, limit } => OpError::TooManyIntersections {
             op,
-            pairs: count,
+            intersections: count,
             limit,
         },
         IntersectError::Device(what) => OpError::Device { op, what },
@@ -175,7 +175,7 @@ pub(crate) fn work(
     let count = count_evaluations(client, &inputs, &state, &frames, &settings);
     let count = count.map_err(|what| op_error(IntersectError::Device(what)))?;
     Ok(crate::RasterizeWork {
-        instances: state.lists.instances as u64,
+        intersections: state.lists.intersections as u64,
         tested: count.tested,
         seen: count.seen,
         blended: count.blended,

@@ -353,7 +353,7 @@ fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
     if !has_adapter() {
         return;
     }
-    // 12,000 splats over each of 4096 x 4 tiles: more than the 195 million pairs that can be listed.
+    // 12,000 splats over each of 4096 x 4 tiles: more than the 195 million intersections that can be listed.
     let n = 12_000;
     let size = ImageSize {
         width: 65_536,
@@ -379,9 +379,9 @@ fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
     let settings = RasterizeSettings::default();
     let error = rasterize(&projected, colors, opacities, None, &settings).unwrap_err();
     println!("{error}");
-    let pairs = n as u64 * 4096 * 4;
+    let intersections = n as u64 * 4096 * 4;
     assert!(
-        matches!(error, OpError::TooManyPairs { pairs: found, .. } if found == pairs),
+        matches!(error, OpError::TooManyIntersections { intersections: found, .. } if found == intersections),
         "{error:?}"
     );
 }

@@ -14,14 +14,14 @@ use crate::cpu::uninit::{Part, Uncleared};
 /// Parts that the counting sort is done in, at most: each counts the tiles for itself.
 const PARTS: usize = 16;
 
-/// The emitted instances brought together tile by tile, in the order in which they were emitted.
+/// The emitted intersections brought together tile by tile, in the order in which they were emitted.
 pub(super) struct ByTile {
-    /// By emitted instance: its splat.
+    /// By emitted intersection: its splat.
     owners: Vec<u32>,
-    /// Where the emitted instances of each splat end.
+    /// Where the emitted intersections of each splat end.
     ends: Vec<u32>,
-    /// The emitted instances by tile.
-    instances: Vec<AtomicU32>,
+    /// The emitted intersections by tile.
+    intersections: Vec<AtomicU32>,
     /// Where each tile's begin, and the last one's end.
     tiles: Vec<u32>,
 }
@@ -52,7 +52,7 @@ impl ByTile {
         }
         tiles.push(next);
 
-        let instances = unset(next as usize);
+        let intersections = unset(next as usize);
         let mut owners = Uncleared::<u32>::new(next as usize);
         let mut ends = Uncleared::<u32>::new(splats);
         let mut start = 0;
@@ -76,21 +76,21 @@ impl ByTile {
             .zip(counts)
             .for_each(|(part, mut next)| {
                 for piece in part {
-                    piece.place(&mut next, &instances);
+                    piece.place(&mut next, &intersections);
                 }
             });
         Self {
             owners: owners.written(),
             ends: ends.written(),
-            instances,
+            intersections,
             tiles,
         }
     }
 
-    /// The lists of the given Gaussians: each tile's instances front to back, and in the order of the Gaussians where their
-    /// splats are equally deep.
+    /// The lists of the given Gaussians: each tile's intersections front to back, and in the order of the Gaussians
+    /// where their splats are equally deep.
     pub(super) fn sorted<T: Real>(self, listed: Vec<u32>, depths: &[T]) -> TileLists {
-        let count = self.instances.len();
+        let count = self.intersections.len();
         let mut splats = Uncleared::<u32>::new(count);
         let places = unset(count);
         splats
@@ -104,18 +104,18 @@ impl ByTile {
             .for_each_init(Vec::new, |keys, (splats, first)| {
                 let splats = splats.overwritten();
                 keys.clear();
-                // Instances are numbered as the splats are.
-                let instances = &self.instances[*first as usize..][..splats.len()];
-                keys.extend(instances.iter().map(|instance| {
-                    let instance = instance.load(Relaxed);
-                    let depth = depths[self.owners[instance as usize] as usize];
-                    depth.sort_key(instance)
+                // Intersections are numbered as the splats are.
+                let intersections = &self.intersections[*first as usize..][..splats.len()];
+                keys.extend(intersections.iter().map(|intersection| {
+                    let intersection = intersection.load(Relaxed);
+                    let depth = depths[self.owners[intersection as usize] as usize];
+                    depth.sort_key(intersection)
                 }));
                 keys.sort_unstable();
                 for ((splat, place), key) in splats.iter_mut().zip(*first..).zip(&*keys) {
-                    let instance = T::index_of(*key) as usize;
-                    places[instance].store(place, Relaxed);
-                    *splat = self.owners[instance];
+                    let intersection = T::index_of(*key) as usize;
+                    places[intersection].store(place, Relaxed);
+                    *splat = self.owners[intersection];
                 }
             });
         TileLists {
@@ -133,17 +133,17 @@ struct Piece<'a> {
     emitted: &'a Emitted,
     /// The first of the splats.
     first: u32,
-    /// The first of the instances.
+    /// The first of the intersections.
     start: u32,
     owners: Part<'a, u32>,
     ends: Part<'a, u32>,
 }
 
 impl Piece<'_> {
-    /// Puts each instance to the next place of its tile.
-    fn place(self, next: &mut [u32], instances: &[AtomicU32]) {
+    /// Puts each intersection to the next place of its tile.
+    fn place(self, next: &mut [u32], intersections: &[AtomicU32]) {
         let Emitted { tiles, ends, .. } = self.emitted;
-        // How many splats begin at an instance, and with their sum which splat it is of.
+        // How many splats begin at an intersection, and with their sum which splat it is of.
         let owners = self.owners.cleared();
         for ((end, own), splat) in self.ends.overwritten().iter_mut().zip(ends).zip(1..) {
             *end = self.start + own;
@@ -157,9 +157,9 @@ impl Piece<'_> {
             *owner = self.first + splat;
         }
         // The places of one piece are anywhere, but no two pieces have one in common.
-        for (tile, instance) in tiles.iter().zip(self.start..) {
+        for (tile, intersection) in tiles.iter().zip(self.start..) {
             let place = &mut next[*tile as usize];
-            instances[*place as usize].store(instance, Relaxed);
+            intersections[*place as usize].store(intersection, Relaxed);
             *place += 1;
         }
     }

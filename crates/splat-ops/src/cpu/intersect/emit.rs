@@ -33,7 +33,7 @@ pub(super) struct Emitted {
     /// Where each splat's end.
     pub(super) ends: Vec<u32>,
     /// How many they are, kept or not.
-    pub(super) pairs: u64,
+    pub(super) intersections: u64,
 }
 
 impl<'a, T: Real> Emission<'a, T> {
@@ -65,7 +65,7 @@ vectorized! {
         let mut emitted = Emitted {
             tiles: Vec::with_capacity(4 * listed.len()),
             ends: Vec::with_capacity(listed.len()),
-            pairs: 0,
+            intersections: 0,
         };
         let mut block = Block::new();
         let outputs = splats.chunks_mut(LANES).zip(depths.chunks_mut(LANES));
@@ -77,7 +77,7 @@ vectorized! {
             }
             let before = emitted.tiles.len();
             block.emit(emission.grid, splats, &mut emitted);
-            emitted.pairs += (emitted.tiles.len() - before) as u64;
+            emitted.intersections += (emitted.tiles.len() - before) as u64;
             if !emission.keeps {
                 emitted.tiles.clear();
             }
@@ -282,9 +282,16 @@ mod tests {
             emit(&emission, &listed, &mut splats, &mut depths)
         };
         let counted = emitted(false);
-        let Emitted { tiles, ends, pairs } = emitted(true);
-        assert_eq!((counted.pairs, counted.tiles.len()), (pairs, 0));
-        assert_eq!(pairs, tiles.len() as u64);
+        let Emitted {
+            tiles,
+            ends,
+            intersections,
+        } = emitted(true);
+        assert_eq!(
+            (counted.intersections, counted.tiles.len()),
+            (intersections, 0)
+        );
+        assert_eq!(intersections, tiles.len() as u64);
         assert_eq!(ends.len(), listed.len());
         assert!(depths.iter().all(|depth| *depth == 1.0));
         for (splat, color) in splats.iter().zip(colors.as_chunks::<2>().0) {

@@ -27,7 +27,7 @@ pub(super) fn blend<T: Real>(
     let view = View::new(&listed, background, args);
     let traces = heaviest_first(
         image,
-        |ty| view.instances_of_row(ty),
+        |ty| view.intersections_of_row(ty),
         |ty, image| {
             let row = RowOfTiles {
                 view: &view,
@@ -61,7 +61,7 @@ impl<T: Real> WithSimd for RowOfTiles<'_, T> {
     fn with_simd<S: Simd>(self) -> Trace<T> {
         let Self { view, ty, image } = self;
         let mut tile = BlendTile::new(view.channels);
-        let splats = view.instances_of_row(ty);
+        let splats = view.intersections_of_row(ty);
         let mut trace = Trace::with_capacity(view.grid.columns, splats);
         for tx in 0..view.grid.columns {
             tile.blend::<S>(view, [tx, ty], &mut trace, &mut ());
@@ -201,13 +201,13 @@ mod tests {
         fn with_simd<S: Simd>(self) -> Self::Output {
             let Self { view, grad, .. } = self;
             let mut image = vec![T::ZERO; grad.len()];
-            let mut partials = vec![T::ZERO; view.lists.instances() * (MOMENTS + CHANNELS)];
+            let mut partials = vec![T::ZERO; view.lists.intersections() * (MOMENTS + CHANNELS)];
             let mut background = vec![];
             let slab = TILE * view.width * (CHANNELS + 1);
             let mut later = &mut *partials;
             for (ty, image) in image.chunks_mut(slab).enumerate() {
                 let trace = RowOfTiles { view, ty, image }.with_simd::<S>();
-                let length = view.instances_of_row(ty);
+                let length = view.intersections_of_row(ty);
                 let (own, rest) = later.split_at_mut(length * (MOMENTS + CHANNELS));
                 later = rest;
                 let row = RowOfTilesBackward {

@@ -9,8 +9,8 @@ use super::splat::{Aligned, BLOCKS, Lanes};
 /// One value per pixel of a tile, by block.
 pub(super) type ByBlock<T> = [Aligned<Lanes<T>>; BLOCKS];
 
-/// Bytes that are kept of each pair of a tile and a splat, at most, with numbers of this size.
-pub(super) const fn kept_per_pair(number: usize) -> usize {
+/// Bytes that are kept of each intersection, at most, with numbers of this size.
+pub(super) const fn kept_per_intersection(number: usize) -> usize {
     size_of::<u16>() + number * (TILE * TILE).div_ceil(BATCH)
 }
 

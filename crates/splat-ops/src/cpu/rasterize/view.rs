@@ -14,7 +14,7 @@ use super::super::uninit::Uncleared;
 use super::gradient::MOMENTS;
 use super::inputs::Camera;
 use super::splat::{GROUP, Splat};
-use super::trace::{Trace, kept_per_pair};
+use super::trace::{Trace, kept_per_intersection};
 use crate::OpError;
 use crate::settings::RasterizeArgs;
 
@@ -47,23 +47,23 @@ pub(super) struct Listed<T> {
 }
 
 impl<T: Real> Listed<T> {
-    /// Bytes kept of each pair of a tile and a splat by the forward pass, and, where a backward pass follows, by its
+    /// Bytes kept of each intersection by the forward pass, and, where a backward pass follows, by its
     /// partial gradients.
-    fn kept_per_pair(channels: usize, args: &RasterizeArgs) -> usize {
+    fn kept_per_intersection(channels: usize, args: &RasterizeArgs) -> usize {
         let number = size_of::<T>();
         let partials = if args.backward {
             (MOMENTS + channels) * number
         } else {
             0
         };
-        kept_per_pair(number) + partials
+        kept_per_intersection(number) + partials
     }
 
     pub(super) fn new(camera: &Camera<T>, args: &RasterizeArgs) -> Result<Self, OpError> {
         let _span = trace_span!("rasterize lists").entered();
         let inputs = [camera.packed, camera.colors, camera.opacities];
         let d = camera.channels;
-        let (lists, splats) = TileLists::new(inputs, args, Self::kept_per_pair(d, args))?;
+        let (lists, splats) = TileLists::new(inputs, args, Self::kept_per_intersection(d, args))?;
         let further = d.saturating_sub(GROUP);
         let mut further_colors = Uncleared::<T>::new(lists.listed.len() * further);
         further_colors
@@ -171,8 +171,8 @@ impl<'a, T: Real> View<'a, T> {
         }
     }
 
-    /// How many splats the tiles of a row have together: its length in what is kept per instance, and its work.
-    pub(super) fn instances_of_row(&self, ty: usize) -> usize {
+    /// How many splats the tiles of a row have together: its length in what is kept per intersection, and its work.
+    pub(super) fn intersections_of_row(&self, ty: usize) -> usize {
         self.lists.row_of_tiles(ty, self.grid).len()
     }
 

@@ -17,8 +17,8 @@ use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
 /// Work of [`rasterize`](crate::rasterize), in numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RasterizeWork {
-    /// Pairs of a tile and a splat that is listed in it.
-    pub instances: u64,
+    /// Listed intersections of splats and tiles.
+    pub intersections: u64,
     /// Pairs of a pixel and a splat whose alpha the forward pass evaluates. The backward pass evaluates about as many.
     pub tested: u64,
     /// Those of them whose alpha reaches `alpha_min`; on the CPU beyond the image's edges too, in the tiles that lie across.
@@ -83,7 +83,7 @@ fn of_camera(camera: &Camera<f32>, args: &RasterizeArgs) -> Result<RasterizeWork
         sum.add(&tile);
         sum
     });
-    work.instances = view.lists.instances() as u64;
+    work.intersections = view.lists.intersections() as u64;
     Ok(work)
 }
 
@@ -99,7 +99,7 @@ fn count_tile<'a, S: Simd>(view: &View<'a, f32>, tile: [usize; 2], work: &mut Ra
 
 impl RasterizeWork {
     fn add(&mut self, other: &Self) {
-        self.instances += other.instances;
+        self.intersections += other.intersections;
         self.tested += other.tested;
         self.seen += other.seen;
         self.blended += other.blended;
@@ -192,7 +192,7 @@ mod tests {
         assert!(missed <= 2, "{work:?}, brute force {seen}");
         assert!(work.seen >= work.blended);
         assert!(work.tested < 2 * work.seen, "{work:?}");
-        assert!(work.instances < 12 * n as u64, "{work:?}");
+        assert!(work.intersections < 12 * n as u64, "{work:?}");
 
         // Two walls at the cap in front leave less than the rest may take away.
         let wall = [30.0, 22.0, 0.1, 1e-4, 0.0, 1e-4, 1.0, 1e5, 1e5f32];
