@@ -10,21 +10,13 @@
 //! operation, or about 20.
 
 use cubecl::prelude::*;
+use splat_core::Activation;
 
 use crate::exp::exp;
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 
-/// A function of one element.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-pub enum Activation {
-    /// `exp(x)`.
-    Exp,
-    /// `1 / (1 + exp(-x))`.
-    Sigmoid,
-}
-
-/// What the three scales and the opacity of each Gaussian, and their gradients, must move.
+/// Floors of the three scales and the opacity of each Gaussian, and of their gradients.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let values = 4 * sizes.gaussians;
     [

@@ -9,37 +9,11 @@
 //! Floor per value: 16 bytes read, 12 written, about 12 operations: bound by memory. Of a row that takes no step, 4 read.
 
 use cubecl::prelude::*;
+use splat_core::{AdamRows, AdamStep};
 
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
 use crate::math::is_finite;
-
-/// The numbers of one step; the bias corrections are in `rate` and `epsilon`.
-#[derive(Clone, Copy, Debug)]
-pub struct AdamStep {
-    /// Decay of the first moment.
-    pub beta_1: f64,
-    /// Decay of the second moment.
-    pub beta_2: f64,
-    /// Learning rate times `sqrt(1 - beta_2^t) / (1 - beta_1^t)`.
-    pub rate: f64,
-    /// Added to the root of the second moment; epsilon times `sqrt(1 - beta_2^t)`.
-    pub epsilon: f64,
-    /// Which rows take the step.
-    pub rows: AdamRows,
-}
-
-/// Which rows of a parameter take a step.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum AdamRows {
-    /// All.
-    All,
-    /// Those whose gradient is not all zero, NaN counting as zero; the others keep parameter and moments.
-    Seen {
-        /// Values per row.
-        width: usize,
-    },
-}
 
 /// Weights of the old moments and of what is new, in this order; rate; epsilon.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
@@ -156,7 +130,7 @@ fn adam_seen_rows(
     }
 }
 
-/// What a step of all parameters must move.
+/// Floor of a step of all parameters.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     let values = sizes.gaussians * sizes.parameters;
     Bytes {
@@ -165,13 +139,14 @@ pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     }
 }
 
-/// Steps a parameter and its moments, given the gradient; all of one length.
+/// Steps a parameter and its moments, given the gradient; all of one length, in rows of `width`.
 pub fn adam(
     client: &Client,
     param: Buffer,
     grad: &Buffer,
     moments: [Buffer; 2],
     step: &AdamStep,
+    width: usize,
 ) -> [Buffer; 3] {
     let [moment_1, moment_2] = moments;
     let buffers = [param, moment_1, moment_2];
@@ -186,7 +161,7 @@ pub fn adam(
     let outputs = [param_out, moment_1_out, moment_2_out];
     match step.rows {
         AdamRows::All => all_rows(client, inputs, outputs, step, len),
-        AdamRows::Seen { width } => {
+        AdamRows::Seen => {
             seen_rows(client, inputs, outputs, step, [len, width.max(1)], copied);
         }
     }

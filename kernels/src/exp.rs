@@ -7,12 +7,24 @@
 //! operations, and 22 of any x.
 
 use cubecl::prelude::*;
+use splat_core::exp::{EXP, EXP_LN2_HIGH, EXP_LN2_LOW, EXP2_NEG, ROUND_TO_INTEGER};
 
 use crate::launch::{Buffer, per_element};
 
-/// 1.5 * 2^23: adding it rounds to the nearest integer and leaves that integer in the low bits.
-const ROUND: f32 = 12_582_912.0;
-const ROUND_BITS: i32 = 0x4b40_0000;
+const ROUND: f32 = ROUND_TO_INTEGER;
+const ROUND_BITS: i32 = ROUND_TO_INTEGER.to_bits() as i32;
+
+// Kernels take constants one by one.
+const TWO_5: f32 = EXP2_NEG[0];
+const TWO_4: f32 = EXP2_NEG[1];
+const TWO_3: f32 = EXP2_NEG[2];
+const TWO_2: f32 = EXP2_NEG[3];
+const TWO_1: f32 = EXP2_NEG[4];
+const E_5: f32 = EXP[0];
+const E_4: f32 = EXP[1];
+const E_3: f32 = EXP[2];
+const E_2: f32 = EXP[3];
+const E_1: f32 = EXP[4];
 
 /// By Horner's rule, coefficients from degree 5 down, the last being 1.
 #[cube]
@@ -28,21 +40,14 @@ pub(crate) fn exp2_neg(t: f32) -> f32 {
     let shifted = ROUND - t;
     // n by its bits: shading languages let a compiler cancel ROUND in (ROUND - t) - ROUND.
     let g = t + (i32::reinterpret(shifted) - ROUND_BITS) as f32;
-    let p = polynomial(
-        g,
-        -0.001_326_472_7,
-        0.009_671_513,
-        -0.055_507_336,
-        0.240_222_42,
-        -0.693_146_94,
-    );
+    let p = polynomial(g, TWO_5, TWO_4, TWO_3, TWO_2, TWO_1);
     // The low bits of `shifted` are n; added to the exponent they multiply by 2^n.
     f32::reinterpret(u32::reinterpret(p) + (u32::reinterpret(shifted) << 23u32))
 }
 
 /// ln(2) in two parts, the first over 512: n times it is exact.
-const LN2_HIGH: i32 = 355;
-const LN2_LOW: f32 = -2.121_944_4e-4;
+const LN2_HIGH: i32 = EXP_LN2_HIGH;
+const LN2_LOW: f32 = EXP_LN2_LOW;
 
 /// `exp(x) = 2^n e^r` with `|r| <= ln(2) / 2`, for any x: infinite and zero where that is out of range, NaN for NaN.
 #[cube]
@@ -55,14 +60,7 @@ pub(crate) fn exp(x: f32) -> f32 {
     // The product in integers: of two of floats, with one factor in common, a compiler may make one.
     let high = x - (n * LN2_HIGH) as f32 / 512.0f32;
     let r = fma(-(n as f32), LN2_LOW, high);
-    let p = polynomial(
-        r,
-        0.008_290_315,
-        0.041_897_93,
-        0.166_676_36,
-        0.499_991_5,
-        0.999_999_7,
-    );
+    let p = polynomial(r, E_5, E_4, E_3, E_2, E_1);
     // n may be 128, or -150: neither is the exponent of a normal number, but those of its halves are.
     let n = u32::reinterpret(n);
     let half = ((n + 1024u32) >> 1u32) - 512u32;

@@ -46,8 +46,8 @@ pub struct Sizes {
     pub gaussians: u64,
     /// Those that reach into the view.
     pub visible: u64,
-    /// (Splat, tile) pairs.
-    pub instances: u64,
+    /// Intersections of splats and tiles.
+    pub intersections: u64,
     /// Width of the view.
     pub width: u64,
     /// Height of the view.

@@ -1,4 +1,4 @@
-//! What every stage shares on the host side: buffers with their length, and how work is folded into workgroups.
+//! Host side of every stage: buffers with their length, and how work is folded into workgroups.
 
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -19,7 +19,7 @@ pub mod activation;
 pub mod adam;
 pub mod blur;
 pub mod copy;
-mod describe;
+mod device_info;
 pub mod exp;
 pub mod floor;
 pub mod intersect;
@@ -38,7 +38,7 @@ pub mod sort;
 pub mod ssim;
 mod work;
 
-pub use describe::describe;
+pub use device_info::device_info;
 #[doc(hidden)]
 pub use launch::poison;
 pub use launch::{Buffer, CUBE_UNITS, HalfBuffer, MOST_BUFFERS, bindable_buffers, reads_half};

@@ -5,7 +5,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use cubecl::features::Plane;
 use cubecl::prelude::*;
 
-/// What [`force_plane_size`] was given; [`ASK`] if nothing.
+/// Size given to [`force_plane_size`]; [`ASK`] if none was.
 static FORCED: AtomicU32 = AtomicU32::new(ASK);
 const ASK: u32 = u32::MAX;
 

@@ -9,13 +9,13 @@
 //! Floor per Gaussian: 8 bytes read and 8 written, and 12 read and 6 operations for every camera.
 
 use cubecl::prelude::*;
+use splat_core::{PROJECTED_EXTENT, PROJECTED_WIDTH};
 
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 use crate::math::is_finite;
-use crate::project::{EXTENT, PACKED};
 
-/// What the sums of one camera must move.
+/// Floor of the sums of one camera.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     Bytes {
         read: 20 * sizes.gaussians,
@@ -42,8 +42,8 @@ fn add_screen_statistics(
         let mut sum = 0.0f32;
         let mut count = 0.0f32;
         for camera in 0..cameras as usize {
-            let at = (camera * gaussians + gaussian) * PACKED;
-            if packed[at + EXTENT] > 0.0f32 {
+            let at = (camera * gaussians + gaussian) * PROJECTED_WIDTH;
+            if packed[at + PROJECTED_EXTENT] > 0.0f32 {
                 let x = gradient[at] * half_width;
                 let y = gradient[at + 1] * half_height;
                 let length = f32::sqrt(x * x + y * y);
@@ -66,7 +66,7 @@ pub fn screen_statistics(
 ) -> [Buffer; 2] {
     let [lengths, views] = sums;
     let gaussians = lengths.len().min(views.len());
-    let cameras = gradient.len().min(packed.len()) / (PACKED * gaussians.max(1));
+    let cameras = gradient.len().min(packed.len()) / (PROJECTED_WIDTH * gaussians.max(1));
     let (lengths, [lengths_in, lengths_out]) = lengths.overwritten(client, 2);
     let (views, [views_in, views_out]) = views.overwritten(client, 3);
     if let Some((count, dim)) = per_element(gaussians) {

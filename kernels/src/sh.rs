@@ -10,33 +10,26 @@
 //! written, about 9 K operations. Gradients: 24 bytes and 12 K read, 12 and 12 K written, about 18 K operations.
 
 use cubecl::prelude::*;
+use splat_core::{SH_C0, SH_C1, SH_C2, SH_C3, SH_DEGREE_MAX, sh_coefficient_count};
 
 use crate::launch::{Buffer, per_element};
 use crate::math::Vec3;
 
-/// Highest degree with a table below.
-pub const MAX_DEGREE: usize = 3;
+const C0: f32 = SH_C0 as f32;
+const C1: f32 = SH_C1 as f32;
+const C2_XY: f32 = SH_C2[0] as f32;
+const C2_ZZ: f32 = SH_C2[1] as f32;
+const C2_XX: f32 = SH_C2[2] as f32;
+const C3_XXX: f32 = SH_C3[0] as f32;
+const C3_XYZ: f32 = SH_C3[1] as f32;
+const C3_XZZ: f32 = SH_C3[2] as f32;
+const C3_ZZZ: f32 = SH_C3[3] as f32;
+const C3_ZXX: f32 = SH_C3[4] as f32;
 
-const C0: f32 = 0.282_094_8;
-const C1: f32 = 0.488_602_52;
-const C2_XY: f32 = 1.092_548_5;
-const C2_ZZ: f32 = 0.315_391_57;
-const C2_XX: f32 = 0.546_274_24;
-const C3_XXX: f32 = 0.590_043_6;
-const C3_XYZ: f32 = 2.890_611_4;
-const C3_XZZ: f32 = 0.457_045_8;
-const C3_ZZZ: f32 = 0.373_176_34;
-const C3_ZXX: f32 = 1.445_305_7;
-
-/// Functions of all bands up to `degree`.
-pub const fn functions(degree: usize) -> usize {
-    (degree + 1) * (degree + 1)
-}
-
-/// `degree`, cut to [`MAX_DEGREE`] and to what so many coefficients are enough for.
+/// `degree`, cut to [`SH_DEGREE_MAX`] and to what so many coefficients are enough for.
 pub(crate) fn usable_degree(degree: usize, stored: usize) -> usize {
-    let mut degree = degree.min(MAX_DEGREE);
-    while degree > 0 && functions(degree) > stored {
+    let mut degree = degree.min(SH_DEGREE_MAX);
+    while degree > 0 && sh_coefficient_count(degree) > stored {
         degree -= 1;
     }
     degree
@@ -157,14 +150,14 @@ fn sh_forward(
     let index = ABSOLUTE_POS;
     if index < gaussians * cameras as usize {
         let d = Vec3::load(dirs, index * 3);
-        let mut y = Array::<f32>::new(comptime!(functions(degree)));
+        let mut y = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
         basis(d.scale(inverse_length(d)), &mut y, degree);
         let first = index % gaussians * stored as usize * 3;
         let mut red = 0.0f32;
         let mut green = 0.0f32;
         let mut blue = 0.0f32;
         #[unroll]
-        for k in 0..comptime!(functions(degree)) {
+        for k in 0..comptime!(sh_coefficient_count(degree)) {
             red += y[k] * coefficients[first + k * 3];
             green += y[k] * coefficients[first + k * 3 + 1];
             blue += y[k] * coefficients[first + k * 3 + 2];
@@ -174,7 +167,7 @@ fn sh_forward(
 }
 
 /// Colours [C, N, 3] for coefficients [N, `stored`, 3] and directions [C, N, 3] of any length. Coefficients beyond
-/// `(degree + 1)²` are not read; `degree` is cut to [`MAX_DEGREE`] and to what is stored.
+/// `(degree + 1)²` are not read; `degree` is cut to [`SH_DEGREE_MAX`] and to what is stored.
 pub fn evaluate(
     client: &Client,
     coefficients: &Buffer,
@@ -226,21 +219,21 @@ fn sh_backward_coefficients(
     let gaussians = gaussians as usize;
     let index = ABSOLUTE_POS;
     if index < gaussians {
-        let mut y = Array::<f32>::new(comptime!(functions(degree)));
-        let mut sums = Array::<f32>::new(comptime!(3 * functions(degree)));
+        let mut y = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
+        let mut sums = Array::<f32>::new(comptime!(3 * sh_coefficient_count(degree)));
         #[unroll]
-        for k in 0..comptime!(3 * functions(degree)) {
+        for k in 0..comptime!(3 * sh_coefficient_count(degree)) {
             sums[k] = 0.0f32;
         }
         for c in 0..cameras as usize {
             let at = (c * gaussians + index) * 3;
             let d = Vec3::load(dirs, at);
             let g = Vec3::load(grad_colors, at);
-            // Of a splat that is not seen nothing is evaluated: were it NaN, zero times it would be too.
+            // A splat that is not seen is not evaluated: were it NaN, zero times it would be too.
             if g.max_abs() != 0.0f32 {
                 basis(d.scale(inverse_length(d)), &mut y, degree);
                 #[unroll]
-                for k in 0..comptime!(functions(degree)) {
+                for k in 0..comptime!(sh_coefficient_count(degree)) {
                     sums[k * 3] += y[k] * g.x;
                     sums[k * 3 + 1] += y[k] * g.y;
                     sums[k * 3 + 2] += y[k] * g.z;
@@ -249,10 +242,10 @@ fn sh_backward_coefficients(
         }
         let first = index * stored as usize * 3;
         #[unroll]
-        for k in 0..comptime!(3 * functions(degree)) {
+        for k in 0..comptime!(3 * sh_coefficient_count(degree)) {
             grad_coefficients[first + k] = sums[k];
         }
-        for k in comptime!(3 * functions(degree))..stored as usize * 3 {
+        for k in comptime!(3 * sh_coefficient_count(degree))..stored as usize * 3 {
             grad_coefficients[first + k] = 0.0f32;
         }
     }
@@ -278,11 +271,11 @@ fn sh_backward_dirs(
         let inverse = inverse_length(d);
         let v = d.scale(inverse);
         let first = index % gaussians * stored as usize * 3;
-        // Of a splat that is not seen nothing is evaluated: were it NaN, zero times it would be too, and reach the camera.
+        // A splat that is not seen is not evaluated: were it NaN, zero times it would be too, and reach the camera.
         if g.max_abs() != 0.0f32 {
-            let mut weights = Array::<f32>::new(comptime!(functions(degree)));
+            let mut weights = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
             #[unroll]
-            for k in 0..comptime!(functions(degree)) {
+            for k in 0..comptime!(sh_coefficient_count(degree)) {
                 weights[k] = guarded_dot(g, Vec3::load(coefficients, first + k * 3));
             }
             direction_vjp(v, inverse, &weights, degree).store(grad_dirs, index * 3);
@@ -293,7 +286,7 @@ fn sh_backward_dirs(
 }
 
 /// Gradients of the coefficients [N, `stored`, 3] and directions [C, N, 3] for that of the colours [C, N, 3]; only
-/// those `wanted`.
+/// those that `needs_grad` names.
 pub fn evaluate_backward(
     client: &Client,
     coefficients: &Buffer,
@@ -301,10 +294,10 @@ pub fn evaluate_backward(
     grad_colors: &Buffer,
     stored: usize,
     degree: usize,
-    wanted: [bool; 2],
+    needs_grad: [bool; 2],
 ) -> [Option<Buffer>; 2] {
     let (gaussians, cameras, degree) = sizes(coefficients, dirs, stored, degree);
-    let grad_coefficients = wanted[0].then(|| {
+    let grad_coefficients = needs_grad[0].then(|| {
         let grad = Buffer::empty(client, coefficients.len());
         if let Some((count, dim)) = per_element(gaussians) {
             sh_backward_coefficients::launch(
@@ -322,7 +315,7 @@ pub fn evaluate_backward(
         }
         grad
     });
-    let grad_dirs = wanted[1].then(|| {
+    let grad_dirs = needs_grad[1].then(|| {
         let grad = Buffer::empty(client, dirs.len());
         if let Some((count, dim)) = per_element(cameras * gaussians) {
             sh_backward_dirs::launch(

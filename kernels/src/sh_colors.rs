@@ -7,34 +7,29 @@
 //! Gradients of Gaussians are summed over cameras inside one unit; those of the centres by blocks of Gaussians and then
 //! over the blocks, in order: no atomics.
 //!
-//! What a camera culled is not evaluated, if the packed splats are given: it is black and passes nothing on.
+//! Gaussians that a camera culled are not evaluated, if the packed splats are given: they are black and pass nothing on.
 //!
 //! Floor, with K = `(degree + 1)²`: 12 bytes of mean and 12 K of coefficients read per Gaussian that a camera sees; for
 //! every camera 4 read and 12 written of each Gaussian, and about 9 K + 25 operations of each that it sees. Gradients:
 //! 12 + 12 K read of each that is seen, and for every camera 12 and of each that it sees 4; 12 + 12 K written; for every
 //! camera about 24 K + 40 operations of each that it sees. Gradients of centres, if wanted, read and compute that once more.
 
+mod backward;
+
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
+use splat_core::{PROJECTED_EXTENT, PROJECTED_WIDTH, ShColorSettings, sh_coefficient_count};
 
+pub use self::backward::sh_colors_backward;
 use crate::floor::{Bytes, Sizes};
-use crate::launch::{
-    Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, F16, F32, HalfBuffer, cube_count, per_element,
-};
+use crate::launch::{Buffer, F16, F32, HalfBuffer, per_element};
 use crate::math::{Vec3, is_below_zero};
-use crate::project::{EXTENT, PACKED};
-use crate::reduce::{sum_blocks, sum_units};
-use crate::sh::{basis, direction_vjp, functions, guarded_dot, inverse_length, usable_degree};
+use crate::sh::{basis, inverse_length, usable_degree};
 
-/// Gaussians that one unit of the centres' gradient sums.
-const CENTER_ITEMS: usize = 4;
-/// Gaussians that one workgroup of it sums.
-const CENTER_BLOCK: usize = CUBE_UNITS_USIZE * CENTER_ITEMS;
-
-/// What forward and gradient must move for one camera.
+/// Floors of forward and gradient for one camera.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let (n, seen) = (sizes.gaussians, sizes.visible);
-    let coefficients = 12 * functions(sizes.degree) as u64;
+    let coefficients = 12 * sh_coefficient_count(sizes.degree) as u64;
     [
         Bytes {
             read: (12 + coefficients) * seen + 4 * n,
@@ -65,9 +60,9 @@ impl ShRest {
     }
 }
 
-/// What the colours are made of.
+/// Inputs of the colours.
 #[derive(Clone, Debug)]
-pub struct ShInputs {
+pub struct ShColorInputs {
     /// Coefficients of degree 0 [N, 1, 3].
     pub sh0: Buffer,
     /// Those of the higher degrees [N, R, 3], if there are any.
@@ -82,7 +77,7 @@ pub struct ShInputs {
     pub seen: Option<Buffer>,
 }
 
-impl ShInputs {
+impl ShColorInputs {
     fn gaussians(&self) -> usize {
         let rest = self.sh_rest.as_ref().filter(|_| self.stored > 0);
         (self.means.len() / 3)
@@ -148,7 +143,7 @@ fn coefficient<R: Float>(rest: &[R], at: usize) -> Vec3 {
 #[cube]
 fn is_seen(packed: &[f32], index: usize, #[comptime] asked: bool) -> bool {
     if comptime!(asked) {
-        packed[index * PACKED + EXTENT] > 0.0f32
+        packed[index * PROJECTED_WIDTH + PROJECTED_EXTENT] > 0.0f32
     } else {
         true.runtime()
     }
@@ -170,7 +165,7 @@ fn unclamped<R: Float>(
     let mut blue = first.z;
     let from = gaussian * stored * 3;
     #[unroll]
-    for k in 1..comptime!(functions(degree)) {
+    for k in 1..comptime!(sh_coefficient_count(degree)) {
         let coefficient = coefficient::<R>(rest, from + (k - 1) * 3);
         red = fma(y[k], coefficient.x, red);
         green = fma(y[k], coefficient.y, green);
@@ -206,7 +201,7 @@ fn sh_colors_forward<R: Float>(
         if is_seen(packed, index, asked) {
             let gaussian = index % gaussians;
             let sight = sight(means, centers, gaussian, index / gaussians);
-            let mut y = Array::<f32>::new(comptime!(functions(degree)));
+            let mut y = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
             basis(sight.unit, &mut y, degree);
             let color = unclamped::<R>(sh0, rest, &y, gaussian, stored as usize, degree);
             Vec3::new(clamped(color.x), clamped(color.y), clamped(color.z))
@@ -217,8 +212,8 @@ fn sh_colors_forward<R: Float>(
     }
 }
 
-/// Colours [C, N, 3]. `degree` is cut to [`crate::sh::MAX_DEGREE`] and to what is stored.
-pub fn sh_colors(client: &Client, inputs: &ShInputs, degree: usize) -> Buffer {
+/// Colours [C, N, 3]. The degree is cut to [`SH_DEGREE_MAX`](splat_core::SH_DEGREE_MAX) and to what is stored.
+pub fn sh_colors(client: &Client, inputs: &ShColorInputs, settings: ShColorSettings) -> Buffer {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
     let colors = Buffer::empty(client, cameras * gaussians * 3);
     let (rest, stored_as) = inputs.rest();
@@ -237,267 +232,10 @@ pub fn sh_colors(client: &Client, inputs: &ShInputs, degree: usize) -> Buffer {
             gaussians as u32,
             cameras as u32,
             inputs.stored as u32,
-            inputs.degree(degree),
+            inputs.degree(settings.degree),
             asked,
             stored_as,
         );
     }
     colors
-}
-
-/// The gradient of a channel before the clamp: none below zero, unless it `recovers` and descent would raise it.
-#[cube]
-fn passed_on_channel(color: f32, g: f32, #[comptime] recovers: bool) -> f32 {
-    let mut stops = is_below_zero(color);
-    if comptime!(recovers) {
-        stops = stops && !is_below_zero(g);
-    }
-    select(stops, 0.0f32, g)
-}
-
-/// The gradient of a colour before the clamp.
-#[cube]
-fn passed_on(color: Vec3, g: Vec3, #[comptime] recovers: bool) -> Vec3 {
-    Vec3::new(
-        passed_on_channel(color.x, g.x, recovers),
-        passed_on_channel(color.y, g.y, recovers),
-        passed_on_channel(color.z, g.z, recovers),
-    )
-}
-
-/// The gradient of the direction, given that of the colour before the clamp.
-#[cube]
-fn sight_vjp<R: Float>(
-    rest: &[R],
-    sight: Sight,
-    g: Vec3,
-    gaussian: usize,
-    stored: usize,
-    #[comptime] degree: usize,
-) -> Vec3 {
-    let mut weights = Array::<f32>::new(comptime!(functions(degree)));
-    // The function of degree 0 does not look at the direction.
-    weights[0] = 0.0f32;
-    let from = gaussian * stored * 3;
-    #[unroll]
-    for k in 1..comptime!(functions(degree)) {
-        weights[k] = guarded_dot(g, coefficient::<R>(rest, from + (k - 1) * 3));
-    }
-    direction_vjp(sight.unit, sight.inverse, &weights, degree)
-}
-
-/// Gradients of Gaussians, summed over cameras; zero for coefficients that are not read.
-#[cube(launch)]
-fn sh_colors_backward_gaussians<R: Float>(
-    sh0: &[f32],
-    rest: &[R],
-    means: &[f32],
-    centers: &[f32],
-    packed: &[f32],
-    grad_colors: &[f32],
-    grad_sh0: &mut [f32],
-    grad_rest: &mut [f32],
-    grad_means: &mut [f32],
-    gaussians: u32,
-    cameras: u32,
-    stored: u32,
-    #[comptime] degree: usize,
-    #[comptime] wanted: [bool; 3],
-    #[comptime] asked: bool,
-    #[comptime] recovers: bool,
-    #[define(R)] _stored_as: ElemType,
-) {
-    let gaussians = gaussians as usize;
-    let stored = stored as usize;
-    let gaussian = ABSOLUTE_POS;
-    if gaussian < gaussians {
-        let mut y = Array::<f32>::new(comptime!(functions(degree)));
-        let mut sums = Array::<f32>::new(comptime!(3 * functions(degree)));
-        #[unroll]
-        for k in 0..comptime!(3 * functions(degree)) {
-            sums[k] = 0.0f32;
-        }
-        let mut mean_x = 0.0f32;
-        let mut mean_y = 0.0f32;
-        let mut mean_z = 0.0f32;
-        for camera in 0..cameras as usize {
-            let index = camera * gaussians + gaussian;
-            let g = Vec3::load(grad_colors, index * 3);
-            // Of a splat without a gradient nothing is evaluated: were it NaN, zero times it would be too.
-            if g.max_abs() != 0.0f32 && is_seen(packed, index, asked) {
-                let sight = sight(means, centers, gaussian, camera);
-                basis(sight.unit, &mut y, degree);
-                let color = unclamped::<R>(sh0, rest, &y, gaussian, stored, degree);
-                let g = passed_on(color, g, recovers);
-                if comptime!(wanted[0] || wanted[1]) {
-                    #[unroll]
-                    for k in 0..comptime!(functions(degree)) {
-                        sums[k * 3] += y[k] * g.x;
-                        sums[k * 3 + 1] += y[k] * g.y;
-                        sums[k * 3 + 2] += y[k] * g.z;
-                    }
-                }
-                if comptime!(wanted[2]) {
-                    let grad = sight_vjp::<R>(rest, sight, g, gaussian, stored, degree);
-                    mean_x += grad.x;
-                    mean_y += grad.y;
-                    mean_z += grad.z;
-                }
-            }
-        }
-        if comptime!(wanted[0]) {
-            Vec3::new(sums[0], sums[1], sums[2]).store(grad_sh0, gaussian * 3);
-        }
-        if comptime!(wanted[1]) {
-            let to = gaussian * stored * 3;
-            #[unroll]
-            for k in 3..comptime!(3 * functions(degree)) {
-                grad_rest[to + k - 3] = sums[k];
-            }
-            for k in comptime!(3 * functions(degree) - 3)..stored * 3 {
-                grad_rest[to + k] = 0.0f32;
-            }
-        }
-        if comptime!(wanted[2]) {
-            Vec3::new(mean_x, mean_y, mean_z).store(grad_means, gaussian * 3);
-        }
-    }
-}
-
-/// Gradients of centres: `partials[camera, block]` = sum over the Gaussians of the block.
-#[cube(launch)]
-fn sh_colors_backward_centers<R: Float>(
-    sh0: &[f32],
-    rest: &[R],
-    means: &[f32],
-    centers: &[f32],
-    packed: &[f32],
-    grad_colors: &[f32],
-    partials: &mut [f32],
-    gaussians: u32,
-    cameras: u32,
-    blocks: u32,
-    stored: u32,
-    #[comptime] degree: usize,
-    #[comptime] asked: bool,
-    #[comptime] recovers: bool,
-    #[define(R)] _stored_as: ElemType,
-) {
-    let mut shared = Shared::new_slice(CUBE_UNITS_USIZE);
-    let gaussians = gaussians as usize;
-    let stored = stored as usize;
-    let camera = CUBE_POS / blocks as usize;
-    let block = CUBE_POS % blocks as usize;
-    let mut x = 0.0f32;
-    let mut y = 0.0f32;
-    let mut z = 0.0f32;
-    if camera < cameras as usize {
-        for item in 0..CENTER_ITEMS {
-            let gaussian = block * CENTER_BLOCK + item * CUBE_UNITS_USIZE + UNIT_POS as usize;
-            if gaussian < gaussians {
-                let index = camera * gaussians + gaussian;
-                let g = Vec3::load(grad_colors, index * 3);
-                // As above: what is broken and not seen must not reach the camera.
-                if g.max_abs() != 0.0f32 && is_seen(packed, index, asked) {
-                    let sight = sight(means, centers, gaussian, camera);
-                    let mut values = Array::<f32>::new(comptime!(functions(degree)));
-                    basis(sight.unit, &mut values, degree);
-                    let color = unclamped::<R>(sh0, rest, &values, gaussian, stored, degree);
-                    let g = passed_on(color, g, recovers);
-                    let grad = sight_vjp::<R>(rest, sight, g, gaussian, stored, degree);
-                    x -= grad.x;
-                    y -= grad.y;
-                    z -= grad.z;
-                }
-            }
-        }
-    }
-    let x = sum_units(&mut shared, x, CUBE_UNITS_USIZE);
-    let y = sum_units(&mut shared, y, CUBE_UNITS_USIZE);
-    let z = sum_units(&mut shared, z, CUBE_UNITS_USIZE);
-    if UNIT_POS == 0 && camera < cameras as usize {
-        Vec3::new(x, y, z).store(partials, CUBE_POS * 3);
-    }
-}
-
-/// Gradients of sh0 [N, 1, 3], `sh_rest` [N, R, 3], means [N, 3] and centres [C, 3] for that of the colours [C, N, 3];
-/// only those `wanted`. With `recovers`, a channel that is clamped passes on a gradient whose descent raises it.
-pub fn sh_colors_backward(
-    client: &Client,
-    inputs: &ShInputs,
-    grad_colors: &Buffer,
-    degree: usize,
-    recovers: bool,
-    wanted: [bool; 4],
-) -> [Option<Buffer>; 4] {
-    let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
-    let degree = inputs.degree(degree);
-    let lens = [gaussians * 3, gaussians * inputs.stored * 3, gaussians * 3];
-    // An unwanted gradient still needs something to bind.
-    let grads: [Buffer; 3] =
-        std::array::from_fn(|i| Buffer::empty(client, if wanted[i] { lens[i] } else { 1 }));
-    if wanted[..3].contains(&true)
-        && let Some((count, dim)) = per_element(gaussians)
-    {
-        let (rest, stored_as) = inputs.rest();
-        let (packed, asked) = inputs.seen();
-        sh_colors_backward_gaussians::launch(
-            client,
-            count,
-            dim,
-            inputs.sh0.arg(),
-            rest,
-            inputs.means.arg(),
-            inputs.centers.arg(),
-            packed,
-            grad_colors.arg(),
-            grads[0].arg(),
-            grads[1].arg(),
-            grads[2].arg(),
-            gaussians as u32,
-            cameras as u32,
-            inputs.stored as u32,
-            degree,
-            [wanted[0], wanted[1], wanted[2]],
-            asked,
-            recovers,
-            stored_as,
-        );
-    }
-    let of_centers = wanted[3].then(|| {
-        let blocks = gaussians.div_ceil(CENTER_BLOCK);
-        let partials = Buffer::empty(client, cameras * blocks * 3);
-        if !partials.is_empty() {
-            let (rest, stored_as) = inputs.rest();
-            let (packed, asked) = inputs.seen();
-            sh_colors_backward_centers::launch(
-                client,
-                cube_count(cameras * blocks),
-                CubeDim::new_1d(CUBE_UNITS),
-                inputs.sh0.arg(),
-                rest,
-                inputs.means.arg(),
-                inputs.centers.arg(),
-                packed,
-                grad_colors.arg(),
-                partials.arg(),
-                gaussians as u32,
-                cameras as u32,
-                blocks as u32,
-                inputs.stored as u32,
-                degree,
-                asked,
-                recovers,
-                stored_as,
-            );
-        }
-        sum_blocks(client, &partials, [cameras, blocks, 3])
-    });
-    let [sh0, sh_rest, means] = grads;
-    [
-        wanted[0].then_some(sh0),
-        wanted[1].then_some(sh_rest),
-        wanted[2].then_some(means),
-        of_centers,
-    ]
 }

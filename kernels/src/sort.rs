@@ -185,7 +185,7 @@ fn scatter(
     let digits = comptime!(ranking.digits());
     let parts = comptime!(ranking.parts());
     let lanes = comptime!(ranking.lanes);
-    // Of every digit and part: first how often it occurs there, then how often in the block before that.
+    // For every digit and part: first how often it occurs there, then how often in the block before that.
     let mut before = Shared::new_slice(comptime!(digits * parts));
     let mut shared = Shared::new_slice(UNITS_USIZE);
     // Occurrences in the block of all lower digits.
@@ -270,12 +270,13 @@ pub fn variant(client: &Client) -> String {
     format!("{} bits a pass, ranks from {ranks}", ranking.digit_bits())
 }
 
-/// What the two sorts of a view must move: the visible splats by depth, then the instances by tile.
+/// Floor of the two sorts of a view: the visible splats by depth, then the intersections by tile.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     let tile = u64::from(TILE);
     let tiles = sizes.width.div_ceil(tile) * sizes.height.div_ceil(tile);
     let passes = |bits: u32| u64::from(bits.div_ceil(sizes.digit_bits.max(1)));
-    let pairs = sizes.visible * passes(32) + sizes.instances * passes(bits_for(tiles as usize + 1));
+    let pairs =
+        sizes.visible * passes(32) + sizes.intersections * passes(bits_for(tiles as usize + 1));
     Bytes {
         read: 12 * pairs,
         written: 8 * pairs,

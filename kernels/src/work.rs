@@ -1,4 +1,4 @@
-//! What the kernels of this crate were asked to do: launches, memory, waits. For benchmarks; counting costs one atomic
+//! Counters of what the kernels of this crate did: launches, memory, waits. For benchmarks; counting costs one atomic
 //! addition each.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 static LAUNCHES: AtomicU64 = AtomicU64::new(0);
 static RESERVED: AtomicU64 = AtomicU64::new(0);
 static WAITS: AtomicU64 = AtomicU64::new(0);
-static INSTANCES: AtomicU64 = AtomicU64::new(0);
+static INTERSECTIONS: AtomicU64 = AtomicU64::new(0);
 
 /// Totals since the process began, over all threads and devices. What a step did is a difference of two:
 ///
@@ -25,19 +25,19 @@ pub struct Work {
     pub reserved_bytes: u64,
     /// How often the host waited for the device.
     pub waits: u64,
-    /// (Splat, tile) pairs that were listed.
-    pub instances: u64,
+    /// Intersections of splats and tiles that were listed.
+    pub intersections: u64,
 }
 
 impl Work {
-    /// What was done after `earlier`.
+    /// The difference to `earlier`.
     #[must_use]
     pub fn since(self, earlier: Self) -> Self {
         Self {
             launches: self.launches - earlier.launches,
             reserved_bytes: self.reserved_bytes - earlier.reserved_bytes,
             waits: self.waits - earlier.waits,
-            instances: self.instances - earlier.instances,
+            intersections: self.intersections - earlier.intersections,
         }
     }
 }
@@ -48,7 +48,7 @@ pub fn work() -> Work {
         launches: LAUNCHES.load(Relaxed),
         reserved_bytes: RESERVED.load(Relaxed),
         waits: WAITS.load(Relaxed),
-        instances: INSTANCES.load(Relaxed),
+        intersections: INTERSECTIONS.load(Relaxed),
     }
 }
 
@@ -64,6 +64,6 @@ pub(crate) fn waited() {
     WAITS.fetch_add(1, Relaxed);
 }
 
-pub(crate) fn listed(instances: usize) {
-    INSTANCES.fetch_add(instances as u64, Relaxed);
+pub(crate) fn listed(intersections: usize) {
+    INTERSECTIONS.fetch_add(intersections as u64, Relaxed);
 }

@@ -5,7 +5,7 @@ use splat_kernels::floor::{Bytes, Sizes, step};
 const SIZES: Sizes = Sizes {
     gaussians: 1000,
     visible: 700,
-    instances: 3000,
+    intersections: 3000,
     width: 160,
     height: 128,
     channels: 3,
@@ -65,7 +65,7 @@ fn floors_are_the_bytes_of_inputs_and_results() {
         written: n * 4 * 2,
     };
     assert_eq!(floors["density"], density);
-    // Of an instance: its number, its slot, six of shape, colour; then its nine sums and again; of a pixel the
+    // Of an intersection: its number, its slot, six of shape, colour; then its nine sums and again; of a pixel the
     // gradient of colour and alpha, what is left, what was walked; of a Gaussian all of its gradients.
     let backward = Bytes {
         read: i * 4 * (2 + 6 + 3) + i * 4 * 9 + pixels * 4 * (4 + 2),
@@ -91,7 +91,7 @@ fn more_work_is_more_bytes() {
             ..SIZES
         },
         Sizes {
-            instances: 4000,
+            intersections: 4000,
             ..SIZES
         },
         Sizes {

@@ -28,7 +28,7 @@ fn a_picture_keeps_the_bytes_that_are_stated() {
             gaussians: splats,
             width,
             height: 128,
-            alpha_min: 1.0 / 255.0,
+            alpha_min: splat_core::ALPHA_MIN as f32,
         };
         let mut packed = Vec::new();
         for i in 0..splats {
@@ -55,21 +55,25 @@ fn a_picture_keeps_the_bytes_that_are_stated() {
             let room = state.lists.splats.len() as u64;
             // The image has one channel and alpha.
             let stated = Kept::per_splat(sums) * splats as u64
-                + Kept::per_instance(sums) * room
+                + Kept::per_intersection(sums) * room
                 + Kept::PER_TILE * frames.tiles() as u64
                 + (Kept::PER_PIXEL + 8) * u64::from(width) * 128;
-            println!("{splats} splats, {room} instances, {sums:?}: {used} bytes, stated {stated}");
-            assert!(room >= state.lists.instances as u64 && room > 0);
+            println!(
+                "{splats} splats, {room} intersections, {sums:?}: {used} bytes, stated {stated}"
+            );
+            assert!(room >= state.lists.intersections as u64 && room > 0);
             // What went with the last launches is still there: so many bytes whatever the sizes.
             assert!((stated..stated + 4096).contains(&used));
 
             let before = work().reserved_bytes;
-            let wanted = [true, true, true, false];
-            rasterize_vjp(&client, &inputs, &state, &image, &frames, &settings, wanted);
+            let needs_grad = [true, true, true, false].into();
+            rasterize_vjp(
+                &client, &inputs, &state, &image, &frames, &settings, needs_grad,
+            );
             let reserved = work().reserved_bytes - before;
             // Gradients of nine floats of a packed splat, one colour and the opacity; and what stands for a missing input.
             let stated = 44 * splats as u64
-                + Kept::gradient_per_instance(1, sums) * state.lists.instances as u64;
+                + Kept::gradient_per_intersection(1, sums) * state.lists.intersections as u64;
             println!("gradient: {reserved} bytes, stated {stated}");
             assert!((stated..=stated + 12).contains(&reserved));
         }

@@ -7,8 +7,9 @@ mod alone;
 
 use alone::alone;
 use cubecl::client::Client;
-use splat_kernels::activation::{Activation, activate};
-use splat_kernels::adam::{AdamRows, AdamStep, adam};
+use splat_core::{Activation, AdamRows, AdamStep};
+use splat_kernels::activation::activate;
+use splat_kernels::adam::adam;
 use splat_kernels::intersect::Frames;
 use splat_kernels::rasterize::{RasterizeInputs, RasterizeSettings, Sums, rasterize};
 use splat_kernels::screen_statistics::screen_statistics;
@@ -28,7 +29,7 @@ fn launches_bytes_and_waits_are_counted() {
         launches: 3,
         reserved_bytes: 4 * (5000 + 3 + 3 + 1),
         waits: 1,
-        instances: 0,
+        intersections: 0,
     };
     assert_eq!(work().since(before), expected);
 }
@@ -40,7 +41,7 @@ fn render(client: &Client, splats: usize, spread: f32) -> (Vec<f32>, Work) {
         gaussians: splats,
         width: 160,
         height: 128,
-        alpha_min: 1.0 / 255.0,
+        alpha_min: splat_core::ALPHA_MIN as f32,
     };
     let mut packed = Vec::new();
     for i in 0..splats {
@@ -63,12 +64,12 @@ fn render(client: &Client, splats: usize, spread: f32) -> (Vec<f32>, Work) {
     let before = work();
     let (image, state) = rasterize(client, &inputs, &frames, &settings).unwrap();
     let done = work().since(before);
-    assert_eq!(done.instances, state.lists.instances as u64);
+    assert_eq!(done.intersections, state.lists.intersections as u64);
     (image.read_f32(client).unwrap(), done)
 }
 
 #[test]
-fn more_instances_than_there_was_room_for_are_listed_again() {
+fn more_intersections_than_there_was_room_for_are_listed_again() {
     let Some((_guard, client)) = alone() else {
         return;
     };
@@ -76,7 +77,7 @@ fn more_instances_than_there_was_room_for_are_listed_again() {
     let (first, again) = render(&client, 200, 0.05);
     let (second, at_once) = render(&client, 200, 0.05);
     println!("{few:?}\n{again:?}\n{at_once:?}");
-    assert!(again.instances > 3 * few.instances);
+    assert!(again.intersections > 3 * few.intersections);
     assert!(again.launches > at_once.launches, "nothing was done again");
     // What was tried with too little room left no trace, and room to spare makes no difference.
     assert_eq!(first, second);
@@ -126,7 +127,7 @@ fn a_step_of_adam_takes_no_memory_but_for_what_something_else_holds() {
         return;
     };
     let grad = Buffer::from_f32(&client, &[1.0; 6]);
-    for rows in [AdamRows::All, AdamRows::Seen { width: 3 }] {
+    for rows in [AdamRows::All, AdamRows::Seen] {
         let step = AdamStep {
             beta_1: 0.5,
             beta_2: 0.5,
@@ -137,7 +138,7 @@ fn a_step_of_adam_takes_no_memory_but_for_what_something_else_holds() {
         let three = || [(); 3].map(|()| Buffer::from_f32(&client, &[0.0; 6]));
         let reserved = |[param, moment_1, moment_2]: [Buffer; 3]| {
             let before = work();
-            let after = adam(&client, param, &grad, [moment_1, moment_2], &step);
+            let after = adam(&client, param, &grad, [moment_1, moment_2], &step, 3);
             let done = work().since(before);
             assert_eq!(done.launches, 1);
             let expected = [-f32::sqrt(0.5), 0.5, 0.5];

@@ -1,11 +1,20 @@
 //! Constants, layouts and settings that the kernels, the ops and the file readers agree on, and how much memory there is.
 //! No dependencies.
 
+pub mod exp;
 pub mod memory;
 mod packed;
 mod settings;
 mod sh;
+mod tensors;
 
-pub use packed::{PROJECTED_EXTENT, PROJECTED_WIDTH};
-pub use settings::{ClampGradient, ImageSize, ProjectSettings, RasterizeSettings, ShColorSettings};
-pub use sh::{SH_C0, SH_DEGREE_MAX, sh_coefficient_count};
+pub use packed::{PROJECTED_DEPTH, PROJECTED_EXTENT, PROJECTED_WIDTH, SPLAT_SIZE_MAX, TILE_SIDE};
+pub use settings::{
+    ALPHA_MIN, Activation, AdamRows, AdamStep, ClampGradient, ImageSize, ProjectSettings,
+    RasterizeSettings, ShColorSettings, SsimArgs,
+};
+pub use sh::{SH_C0, SH_C1, SH_C2, SH_C3, SH_DEGREE_MAX, sh_coefficient_count};
+pub use tensors::{
+    AdamTensors, ProjectTensors, RasterizeTensors, ScreenStatisticsTensors, ShColorTensors,
+    SphericalHarmonicsTensors, SsimTensors,
+};

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 /// How long a measurement is good for what needs little of it.
 const FRESH: Duration = Duration::from_secs(1);
-/// What needs more than this share of the memory left is worth measuring again.
+/// A need of more than this share of the memory left is worth measuring again.
 const LARGE_SHARE: u64 = 4;
 /// A share of the memory left is not counted on: what lies between large allocations may be too small for the next.
 const SLACK_SHARE: u64 = 8;
@@ -49,7 +49,7 @@ pub fn lacking(needed: u64) -> Option<u64> {
     let (at, left) = known.unwrap_or_else(|| (Instant::now(), available_memory()));
     let usable = left.map(|left| (left - left / SLACK_SHARE).saturating_sub(RESERVE));
     let lacking = usable.filter(|usable| needed > *usable);
-    // What is granted now is not there for the next who asks.
+    // Memory granted now is not there for the next who asks.
     let granted = if lacking.is_none() { needed } else { 0 };
     *last = Some((at, left.map(|left| left.saturating_sub(granted))));
     lacking
@@ -87,7 +87,7 @@ fn limit(limits: &str, name: &str) -> Option<u64> {
     line.split_whitespace().next()?.parse().ok()
 }
 
-/// What the control groups of this process (`/proc/self/cgroup`), and those that they are in, may still use.
+/// Memory that the control groups of this process (`/proc/self/cgroup`), and those that they are in, may still use.
 fn left_in_groups(groups: &str, read: &dyn Fn(&Path) -> Option<String>) -> Option<u64> {
     let left = groups.lines().filter_map(|line| {
         let [_, controllers, path] = line.splitn(3, ':').collect::<Vec<_>>().try_into().ok()?;
@@ -117,7 +117,7 @@ fn left_in_groups(groups: &str, read: &dyn Fn(&Path) -> Option<String>) -> Optio
     left.min()
 }
 
-/// What one group may still use: its limit less its use, of which files that were read are given back when needed.
+/// Memory that one group may still use: its limit less its use, of which files that were read are given back when needed.
 fn left_in_group(
     folder: PathBuf,
     [max, current, files]: [&str; 3],

@@ -10,7 +10,7 @@ pub struct ImageSize {
 }
 
 /// Smallest opacity that still changes an 8-bit image (3DGS appendix C).
-const ALPHA_MIN: f64 = 1.0 / 255.0;
+pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 
 /// Settings of `project`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -54,8 +54,8 @@ pub struct RasterizeSettings {
     pub transmittance_min: f64,
     /// Whether the same input gives the same gradients, bit for bit, every time. Default true. False, on a CubeCL device:
     /// the tiles' shares of a splat's gradient are added up as they come, which differs from run to run in the last digits.
-    /// It saves memory, 24 bytes and 4 per channel of each (splat, tile) pair in the backward pass, and from the forward
-    /// pass on 4 of each pair and 12 of each Gaussian and camera; docs/GPU.md has what it does to the time. The CPU sums
+    /// It saves memory, 24 bytes and 4 per channel of each intersection in the backward pass, and from the forward
+    /// pass on 4 of each and 12 of each Gaussian and camera; docs/GPU.md has what it does to the time. The CPU sums
     /// in order in any case.
     pub deterministic: bool,
 }
@@ -98,4 +98,51 @@ impl From<usize> for ShColorSettings {
             ..Self::default()
         }
     }
+}
+
+/// A function of one element.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Activation {
+    /// `exp(x)`.
+    Exp,
+    /// `1 / (1 + exp(-x))`.
+    Sigmoid,
+}
+
+/// The numbers of one step of Adam; the bias corrections are already in `rate` and `epsilon`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdamStep {
+    /// Decay of the first moment.
+    pub beta_1: f64,
+    /// Decay of the second moment.
+    pub beta_2: f64,
+    /// Learning rate times `sqrt(1 - beta_2^t) / (1 - beta_1^t)`.
+    pub rate: f64,
+    /// Added to the root of the second moment; epsilon times `sqrt(1 - beta_2^t)`.
+    pub epsilon: f64,
+    /// Which rows take the step.
+    pub rows: AdamRows,
+}
+
+/// Which rows of a parameter, along its first dimension, a step changes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum AdamRows {
+    /// All, as Adam is defined: where the gradient is zero, moments decay and parameters drift on.
+    #[default]
+    All,
+    /// Those whose gradient is not all zero, NaN counting as zero; the others keep parameter and moments, as if the step
+    /// had not been for them (the sparse Adam of Mallick et al. 2024, *Taming 3DGS*; `SelectiveAdam` of gsplat). Another
+    /// optimiser with other results, and faster where most Gaussians are out of view.
+    Seen,
+}
+
+/// Window and constants of structural similarity.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SsimArgs {
+    /// Weights along one axis, symmetric, of odd length.
+    pub window: Vec<f64>,
+    /// Constant of the luminance term.
+    pub c1: f64,
+    /// Constant of the contrast term.
+    pub c2: f64,
 }

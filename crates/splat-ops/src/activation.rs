@@ -2,17 +2,10 @@
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
+use tracing::trace_span;
 
-use crate::backend::SplatOps;
-
-/// A function of one element.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Activation {
-    /// `exp(x)`.
-    Exp,
-    /// `1 / (1 + exp(-x))`.
-    Sigmoid,
-}
+use crate::backend::ActivationOps;
+use crate::settings::Activation;
 
 /// `exp(x)`, of logarithms of scales for example. The same function as [`Tensor::exp`], to 2 units in the last place on
 /// every device; on the CPU in SIMD and parallel.
@@ -30,8 +23,6 @@ pub fn sigmoid<const D: usize>(x: Tensor<D>) -> Tensor<D> {
 }
 
 fn activate<const D: usize>(x: Tensor<D>, function: Activation) -> Tensor<D> {
-    Tensor::from_dispatch(<Dispatch as SplatOps>::activation(
-        x.into_dispatch(),
-        function,
-    ))
+    let _span = trace_span!("activations").entered();
+    Tensor::from_dispatch(Dispatch::activation(x.into_dispatch(), function))
 }

@@ -1,427 +1,365 @@
-//! What a backend must provide ([`SplatBackend`]), and the route from Burn's device-dispatched
-//! tensors to it (`SplatOps`).
+//! The traits of a backend: for each op a trait of the op as Burn dispatches it ([`ProjectOps`]), and for one with a
+//! gradient of its own a trait of that ([`ProjectBackend`]). [`SplatBackend`] is all of them.
+//!
+//! Callers have checked all shapes; tensors need not be contiguous. A gradient function is told which gradients are
+//! needed; the others are `None` and cost nothing.
 
 use core::fmt::Debug;
 
+use burn::backend::tensor::{FloatTensor, IntTensor};
 use burn::backend::{
-    Backend, ExtensionType, backend_extension,
-    tensor::{FloatTensor, IntTensor},
+    Backend, BackendTensor, DispatchAutodiffContext, DispatchTensor, DispatchTensorKind,
+    ExtensionType, backend_extension,
 };
 // The expansion of `#[backend_extension]` names these.
 #[allow(unused_imports)]
 use burn::backend::{Autodiff, Dispatch};
 
-use crate::activation::Activation;
-use crate::adam::AdamStep;
-use crate::composed;
-use crate::settings::{ProjectArgs, RasterizeArgs, ShColorSettings};
-use crate::ssim::SsimArgs;
+use crate::settings::{
+    Activation, AdamStep, ProjectArgs, RasterizeArgs, ShColorSettings, SsimArgs,
+};
 
-pub use splat_core::{PROJECTED_EXTENT, PROJECTED_WIDTH};
+pub use splat_core::{
+    AdamTensors, PROJECTED_EXTENT, PROJECTED_WIDTH, ProjectTensors, RasterizeTensors,
+    ScreenStatisticsTensors, ShColorTensors, SphericalHarmonicsTensors, SsimTensors,
+};
 
-/// The forward and backward computations of one backend. Callers have checked all shapes; tensors
-/// need not be contiguous. `wanted` says which gradients are needed, in the order of the inputs;
-/// the others are `None` and cost nothing.
-pub trait SplatBackend: Backend {
-    /// What `rasterize_forward` keeps for its backward: lists of splats per tile, final
-    /// transmittances and the like.
-    type RasterizeState: Clone + Debug + Send + 'static;
-
-    /// Means `[N, 3]`, quats `[N, 4]`, scales `[N, 3]`, viewmats `[C, 4, 4]`, intrinsics `[C, 4]`
-    /// to packed splats `[C, N, 9]`.
-    fn project_forward(
-        means: FloatTensor<Self>,
-        quats: FloatTensor<Self>,
-        scales: FloatTensor<Self>,
-        viewmats: FloatTensor<Self>,
-        intrinsics: FloatTensor<Self>,
-        args: &ProjectArgs,
-    ) -> FloatTensor<Self>;
-
-    /// Gradients of the five inputs of [`project_forward`](Self::project_forward), given the
-    /// gradient `[C, N, 9]` of its output.
-    fn project_backward(
-        means: FloatTensor<Self>,
-        quats: FloatTensor<Self>,
-        scales: FloatTensor<Self>,
-        viewmats: FloatTensor<Self>,
-        intrinsics: FloatTensor<Self>,
-        grad_packed: FloatTensor<Self>,
-        args: &ProjectArgs,
-        wanted: [bool; 5],
-    ) -> [Option<FloatTensor<Self>>; 5];
-
-    /// Coefficients `[N, K, 3]`, K >= (degree + 1)^2, and directions `[C, N, 3]` to `[C, N, 3]`.
-    fn spherical_harmonics_forward(
-        coeffs: FloatTensor<Self>,
-        dirs: FloatTensor<Self>,
-        degree: usize,
-    ) -> FloatTensor<Self>;
-
-    /// Gradients of coefficients and directions, given the gradient `[C, N, 3]` of the output.
-    fn spherical_harmonics_backward(
-        coeffs: FloatTensor<Self>,
-        dirs: FloatTensor<Self>,
-        grad: FloatTensor<Self>,
-        degree: usize,
-        wanted: [bool; 2],
-    ) -> [Option<FloatTensor<Self>>; 2];
-
-    /// [`sh_colors`](crate::sh_colors): `[N, 1, 3]`, `[N, R, 3]`, means `[N, 3]` and centres `[C, 3]` to `[C, N, 3]`. There
-    /// are higher coefficients exactly when the degree is above 0.
-    fn sh_colors_forward(inputs: ShInputs<Self>, settings: ShColorSettings) -> FloatTensor<Self>;
-
-    /// Gradients of the four inputs, given the gradient `[C, N, 3]` of the colours.
-    fn sh_colors_backward(
-        inputs: ShInputs<Self>,
-        grad: FloatTensor<Self>,
-        settings: ShColorSettings,
-        wanted: [bool; 4],
-    ) -> [Option<FloatTensor<Self>>; 4];
-
-    /// [`exp`](crate::exp) or [`sigmoid`](crate::sigmoid) of every element. Composed of tensor ops unless a backend knows
-    /// better.
-    fn activate(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self> {
-        composed::activate::<Self>(x, function)
-    }
-
-    /// Gradient of the input, given the input, the output and the output's gradient.
-    fn activate_backward(
-        x: FloatTensor<Self>,
-        y: FloatTensor<Self>,
-        grad: FloatTensor<Self>,
-        function: Activation,
-    ) -> FloatTensor<Self> {
-        composed::activate_backward::<Self>(x, y, grad, function)
-    }
-
-    /// Packed splats `[C, N, 9]`, colours `[C, N, D]`, opacities `[C, N]` and background `[C, D]`
-    /// to `[C, H, W, D + 1]`, the last channel being alpha.
-    ///
-    /// What goes wrong is reported to `args.errors`; the image is then zero, and the gradients that the state leads to
-    /// are.
-    fn rasterize_forward(
-        packed: FloatTensor<Self>,
-        colors: FloatTensor<Self>,
-        opacities: FloatTensor<Self>,
-        background: Option<FloatTensor<Self>>,
-        args: &RasterizeArgs,
-    ) -> (FloatTensor<Self>, Self::RasterizeState);
-
-    /// Gradients of packed splats, colours, opacities and background, given the forward's output
-    /// and state and the gradient `[C, H, W, D + 1]` of that output.
-    fn rasterize_backward(
-        packed: FloatTensor<Self>,
-        colors: FloatTensor<Self>,
-        opacities: FloatTensor<Self>,
-        background: Option<FloatTensor<Self>>,
-        output: FloatTensor<Self>,
-        state: Self::RasterizeState,
-        grad_output: FloatTensor<Self>,
-        args: &RasterizeArgs,
-        wanted: [bool; 4],
-    ) -> [Option<FloatTensor<Self>>; 4];
-
-    /// Convolves rows and columns of `[B, H, W, D]` with a symmetric window of odd length, zeros
-    /// outside. Linear and self-adjoint: its own vector-Jacobian product.
-    fn gaussian_blur(image: FloatTensor<Self>, window: &[f64]) -> FloatTensor<Self>;
-
-    /// [`ssim_map`](crate::ssim_map) of two images, and what the backend keeps for the gradient.
-    fn ssim_forward(
-        images: [FloatTensor<Self>; 2],
-        args: &SsimArgs,
-    ) -> (FloatTensor<Self>, Vec<FloatTensor<Self>>) {
-        composed::ssim_forward::<Self>(images, args)
-    }
-
-    /// Gradients of both images, given that of the map.
-    fn ssim_backward(
-        images: [FloatTensor<Self>; 2],
-        moments: Vec<FloatTensor<Self>>,
-        grad: FloatTensor<Self>,
-        args: &SsimArgs,
-        wanted: [bool; 2],
-    ) -> [Option<FloatTensor<Self>>; 2] {
-        composed::ssim_backward::<Self>(images, moments, grad, args, wanted)
-    }
-
-    /// [`Photometric::losses`](crate::Photometric::losses), `[2]`.
-    fn photometric(
-        rendered: FloatTensor<Self>,
-        target: Target<Self>,
-        args: &SsimArgs,
-    ) -> FloatTensor<Self> {
-        composed::photometric::<Self>(rendered, target, args)
-    }
-
-    /// The same, and what the backend keeps for the gradient.
-    fn photometric_tracked(
-        rendered: FloatTensor<Self>,
-        target: Target<Self>,
-        args: &SsimArgs,
-    ) -> (FloatTensor<Self>, FloatTensor<Self>) {
-        composed::photometric_tracked::<Self>(rendered, target, args)
-    }
-
-    /// Gradient `[B, H, W, E]` of what was rendered, given what was kept and the gradient `[2]` of the means.
-    fn photometric_backward(
-        rendered: FloatTensor<Self>,
-        target: Target<Self>,
-        kept: FloatTensor<Self>,
-        grad: FloatTensor<Self>,
-        _args: &SsimArgs,
-    ) -> FloatTensor<Self> {
-        composed::photometric_backward::<Self>(rendered, target, kept, grad)
-    }
-
-    /// [`ScreenStatistics::add`](crate::ScreenStatistics::add): gradient and splats `[C, N, 9]` and both sums `[N]` to the
-    /// sums with the lengths of `half * gradient` and the views added.
-    fn add_screen_statistics(
-        tensors: [FloatTensor<Self>; 4],
-        half: [f64; 2],
-    ) -> [FloatTensor<Self>; 2];
-
-    /// Parameter, gradient and both moments to parameter and moments after [`adam_step`](crate::adam_step).
-    fn adam(tensors: [FloatTensor<Self>; 4], step: &AdamStep) -> [FloatTensor<Self>; 3];
-}
-
-/// What [`sh_colors`](crate::sh_colors) takes.
+/// The tensors of one op, in the form in which Burn's dispatch carries them.
 #[derive(Debug, Clone)]
-pub struct ShInputs<B: Backend> {
-    /// `[N, 1, 3]`.
-    pub sh0: FloatTensor<B>,
-    /// `[N, R, 3]`; absent at degree 0.
-    pub sh_rest: Option<FloatTensor<B>>,
-    /// `[N, 3]`.
-    pub means: FloatTensor<B>,
-    /// `[C, 3]`.
-    pub centers: FloatTensor<B>,
-    /// Packed splats `[C, N, 9]`, of which those without an extent have no colour.
-    pub seen: Option<FloatTensor<B>>,
-}
+pub struct OpInputs<X>(pub X);
 
-/// A parameter and its moments, in the form in which Burn's dispatch can carry them.
-#[derive(ExtensionType)]
-pub(crate) struct AdamTensors<B: Backend> {
-    pub(crate) param: FloatTensor<B>,
-    pub(crate) moment_1: FloatTensor<B>,
-    pub(crate) moment_2: FloatTensor<B>,
-}
+/// Names the inputs of ops, and takes them through Burn's dispatch.
+macro_rules! inputs {
+    ($($(#[$doc:meta])* $name:ident = $tensors:ty;)+) => {$(
+        $(#[$doc])*
+        pub type $name<B> = OpInputs<$tensors>;
 
-/// Sums of screen gradients and of views, in the form in which Burn's dispatch can carry them.
-#[derive(ExtensionType)]
-pub(crate) struct StatisticsTensors<B: Backend> {
-    pub(crate) gradients: FloatTensor<B>,
-    pub(crate) views: FloatTensor<B>,
-}
+        impl<B: Backend> ExtensionType<B> for $name<B> {
+            type Target = $name<Dispatch>;
 
-/// An optional tensor, in the form in which Burn's dispatch can carry one.
-#[derive(ExtensionType)]
-pub(crate) enum Optional<B: Backend> {
-    Some(FloatTensor<B>),
-    None,
-}
+            fn map_to_dispatch<F>(self, map_kind: F, autodiff: DispatchAutodiffContext) -> Self::Target
+            where
+                F: Fn(BackendTensor<B>) -> DispatchTensorKind,
+            {
+                OpInputs(self.0.map_inputs(|tensor| DispatchTensor {
+                    kind: map_kind(BackendTensor::Float(tensor)),
+                    autodiff,
+                }))
+            }
 
-impl<B: Backend> Optional<B> {
-    pub(crate) fn into_option(self) -> Option<FloatTensor<B>> {
-        match self {
-            Self::Some(tensor) => Some(tensor),
-            Self::None => None,
+            fn map_from_dispatch<F>(target: Self::Target, unwrap_kind: F) -> Self
+            where
+                F: Fn(DispatchTensor) -> BackendTensor<B>,
+            {
+                OpInputs(target.0.map_inputs(|tensor| unwrap_kind(tensor).float()))
+            }
+
+            fn routing_tensor(target: &Self::Target) -> Option<&DispatchTensor> {
+                <[_; _]>::from(target.0.inputs()).into_iter().flatten().next()
+            }
+
+            fn routing_float_tensor(target: &Self::Target) -> Option<&DispatchTensor> {
+                <Self as ExtensionType<B>>::routing_tensor(target)
+            }
+
+            fn autodiff_context(target: &Self::Target) -> DispatchAutodiffContext {
+                let tensors = <[_; _]>::from(target.0.inputs()).into_iter().flatten();
+                tensors.fold(DispatchAutodiffContext::Disabled, |context, tensor| {
+                    context.merge(tensor.autodiff)
+                })
+            }
         }
-    }
+    )+};
 }
 
-/// What [`photometric`](crate::photometric) compares with, `[B, H, W, D]`, in the form in which Burn's dispatch can
-/// carry it.
+inputs! {
+    /// OpInputs of [`ProjectOps`].
+    ProjectInputs = ProjectTensors<FloatTensor<B>>;
+    /// OpInputs of [`SphericalHarmonicsOps`].
+    SphericalHarmonicsInputs = SphericalHarmonicsTensors<FloatTensor<B>>;
+    /// OpInputs of [`ShColorsOps`].
+    ShColorInputs = ShColorTensors<FloatTensor<B>, Option<FloatTensor<B>>>;
+    /// OpInputs of [`RasterizeOps`].
+    RasterizeInputs = RasterizeTensors<FloatTensor<B>, Option<FloatTensor<B>>>;
+    /// OpInputs of [`SsimOps`].
+    SsimInputs = SsimTensors<FloatTensor<B>>;
+    /// OpInputs of [`AdamOps`].
+    AdamInputs = AdamTensors<FloatTensor<B>>;
+    /// OpInputs of [`ScreenStatisticsOps`].
+    ScreenStatisticsInputs = ScreenStatisticsTensors<FloatTensor<B>>;
+}
+
+/// Gradients of [`ProjectInputs`].
+pub type ProjectGradients<B> = ProjectTensors<Option<FloatTensor<B>>>;
+/// Gradients of [`SphericalHarmonicsInputs`].
+pub type SphericalHarmonicsGradients<B> = SphericalHarmonicsTensors<Option<FloatTensor<B>>>;
+/// Gradients of [`ShColorInputs`].
+pub type ShColorGradients<B> = ShColorTensors<Option<FloatTensor<B>>>;
+/// Gradients of [`RasterizeInputs`].
+pub type RasterizeGradients<B> = RasterizeTensors<Option<FloatTensor<B>>>;
+/// Gradients of [`SsimInputs`].
+pub type SsimGradients<B> = SsimTensors<Option<FloatTensor<B>>>;
+
+/// Photo that [`photometric`](crate::photometric) compares with, `[B, H, W, D]`, in the form in which Burn's dispatch
+/// carries it.
 #[derive(Debug, Clone, ExtensionType)]
 pub enum Target<B: Backend> {
-    /// Of any integer type, 0 to 255, for `level / 255`.
+    /// Levels of any integer type, 0 to 255, for `level / 255`.
     Levels(IntTensor<B>),
     /// As they are.
     Values(FloatTensor<B>),
 }
 
-/// The forward ops as Burn dispatches them: to Flex, to CubeCL, or through autodiff to either.
+/// A parameter and its moments after a step, in the form in which Burn's dispatch carries them.
+#[derive(Debug, Clone, ExtensionType)]
+pub struct AdamOutputs<B: Backend> {
+    /// Parameter.
+    pub param: FloatTensor<B>,
+    /// First moment.
+    pub moment_1: FloatTensor<B>,
+    /// Second moment.
+    pub moment_2: FloatTensor<B>,
+}
+
+/// Sums of screen gradients and of views, in the form in which Burn's dispatch carries them.
+#[derive(Debug, Clone, ExtensionType)]
+pub struct ScreenStatisticsOutputs<B: Backend> {
+    /// Sums of the lengths of screen gradients `[N]`.
+    pub gradients: FloatTensor<B>,
+    /// Sums of views `[N]`.
+    pub views: FloatTensor<B>,
+}
+
+/// [`project`](crate::project).
 #[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
-pub(crate) trait SplatOps: Backend {
+pub trait ProjectOps: Backend {
+    /// Packed splats `[C, N, 9]`.
     fn project(
-        means: FloatTensor<Self>,
-        quats: FloatTensor<Self>,
-        scales: FloatTensor<Self>,
-        viewmats: FloatTensor<Self>,
-        intrinsics: FloatTensor<Self>,
+        #[extension_type] inputs: ProjectInputs<Self>,
         args: ProjectArgs,
     ) -> FloatTensor<Self>;
+}
 
+/// The gradient of [`ProjectOps`].
+pub trait ProjectBackend: ProjectOps {
+    /// Given the gradient `[C, N, 9]` of the packed splats.
+    fn project_backward(
+        inputs: ProjectInputs<Self>,
+        grad_packed: FloatTensor<Self>,
+        args: &ProjectArgs,
+        needs_grad: ProjectTensors<bool>,
+    ) -> ProjectGradients<Self>;
+}
+
+/// [`Projected::with_screen_probe`](crate::Projected::with_screen_probe).
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub trait ScreenProbeOps: Backend {
+    /// The packed splats as they are; their gradient goes to the probe too.
+    fn screen_probe(packed: FloatTensor<Self>, _probe: FloatTensor<Self>) -> FloatTensor<Self> {
+        packed
+    }
+}
+
+/// [`spherical_harmonics`](crate::spherical_harmonics()).
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub trait SphericalHarmonicsOps: Backend {
+    /// Colours `[C, N, 3]`.
     fn spherical_harmonics(
-        coeffs: FloatTensor<Self>,
-        dirs: FloatTensor<Self>,
+        #[extension_type] inputs: SphericalHarmonicsInputs<Self>,
         degree: usize,
     ) -> FloatTensor<Self>;
+}
 
+/// The gradient of [`SphericalHarmonicsOps`].
+pub trait SphericalHarmonicsBackend: SphericalHarmonicsOps {
+    /// Given the gradient `[C, N, 3]` of the colours.
+    fn spherical_harmonics_backward(
+        inputs: SphericalHarmonicsInputs<Self>,
+        grad_colors: FloatTensor<Self>,
+        degree: usize,
+        needs_grad: SphericalHarmonicsTensors<bool>,
+    ) -> SphericalHarmonicsGradients<Self>;
+}
+
+/// [`sh_colors`](crate::sh_colors()).
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub trait ShColorsOps: Backend {
+    /// Colours `[C, N, 3]`. There are higher coefficients exactly when the degree is above 0.
     fn sh_colors(
-        sh0: FloatTensor<Self>,
-        #[extension_type] sh_rest: Optional<Self>,
-        means: FloatTensor<Self>,
-        centers: FloatTensor<Self>,
-        #[extension_type] seen: Optional<Self>,
+        #[extension_type] inputs: ShColorInputs<Self>,
         settings: ShColorSettings,
     ) -> FloatTensor<Self>;
+}
 
+/// The gradient of [`ShColorsOps`].
+pub trait ShColorsBackend: ShColorsOps {
+    /// Given the gradient `[C, N, 3]` of the colours.
+    fn sh_colors_backward(
+        inputs: ShColorInputs<Self>,
+        grad_colors: FloatTensor<Self>,
+        settings: ShColorSettings,
+        needs_grad: ShColorTensors<bool>,
+    ) -> ShColorGradients<Self>;
+}
+
+/// [`exp`](crate::exp) and [`sigmoid`](crate::sigmoid).
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub trait ActivationOps: Backend {
+    /// The function of every element.
     fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self>;
+}
 
-    fn screen_probe(packed: FloatTensor<Self>, probe: FloatTensor<Self>) -> FloatTensor<Self>;
+/// The gradient of [`ActivationOps`].
+pub trait ActivationBackend: ActivationOps {
+    /// Gradient of the input x, given x, the output y, and the gradient of y.
+    fn activation_backward(
+        x: FloatTensor<Self>,
+        y: FloatTensor<Self>,
+        grad_y: FloatTensor<Self>,
+        function: Activation,
+    ) -> FloatTensor<Self>;
+}
 
+/// [`rasterize`](crate::rasterize()).
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub trait RasterizeOps: Backend {
+    /// `[C, H, W, D + 1]`, the last channel being alpha.
+    ///
+    /// Errors are reported to `args.errors`; the image is then zero, and the gradients that the state leads to
+    /// are.
     fn rasterize(
-        packed: FloatTensor<Self>,
-        colors: FloatTensor<Self>,
-        opacities: FloatTensor<Self>,
-        #[extension_type] background: Optional<Self>,
+        #[extension_type] inputs: RasterizeInputs<Self>,
         args: RasterizeArgs,
     ) -> FloatTensor<Self>;
+}
 
+/// The gradient of [`RasterizeOps`].
+pub trait RasterizeBackend: RasterizeOps {
+    /// Kept from the forward pass for the backward pass: lists of splats per tile, final transmittances and the like.
+    type RasterizeState: Clone + Debug + Send + 'static;
+
+    /// [`RasterizeOps::rasterize`], and what its gradient needs.
+    fn rasterize_tracked(
+        inputs: RasterizeInputs<Self>,
+        args: &RasterizeArgs,
+    ) -> (FloatTensor<Self>, Self::RasterizeState);
+
+    /// Given the forward pass's state and the gradient `[C, H, W, D + 1]` of its output.
+    fn rasterize_backward(
+        inputs: RasterizeInputs<Self>,
+        state: Self::RasterizeState,
+        grad_output: FloatTensor<Self>,
+        args: &RasterizeArgs,
+        needs_grad: RasterizeTensors<bool>,
+    ) -> RasterizeGradients<Self>;
+}
+
+/// [`gaussian_blur`](crate::gaussian_blur); linear and self-adjoint, and so its own gradient.
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub trait BlurOps: Backend {
+    /// Rows and columns of `[B, H, W, D]` under a symmetric window of odd length, zeros outside.
     fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self>;
+}
 
-    fn ssim(x: FloatTensor<Self>, y: FloatTensor<Self>, args: SsimArgs) -> FloatTensor<Self>;
+/// [`ssim_map`](crate::ssim_map).
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub trait SsimOps: Backend {
+    /// The map `[B, H, W, D]`.
+    fn ssim(#[extension_type] inputs: SsimInputs<Self>, args: SsimArgs) -> FloatTensor<Self>;
+}
 
+/// The gradient of [`SsimOps`].
+pub trait SsimBackend: SsimOps {
+    /// [`SsimOps::ssim`], and the windowed moments that its gradient needs.
+    fn ssim_tracked(
+        inputs: SsimInputs<Self>,
+        args: &SsimArgs,
+    ) -> (FloatTensor<Self>, Vec<FloatTensor<Self>>);
+
+    /// Given the moments and the gradient of the map.
+    fn ssim_backward(
+        inputs: SsimInputs<Self>,
+        moments: Vec<FloatTensor<Self>>,
+        grad_map: FloatTensor<Self>,
+        args: &SsimArgs,
+        needs_grad: SsimTensors<bool>,
+    ) -> SsimGradients<Self>;
+}
+
+/// [`photometric`](crate::photometric()).
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub trait PhotometricOps: Backend {
+    /// [`Photometric::losses`](crate::Photometric::losses), `[2]`.
     fn photometric(
         rendered: FloatTensor<Self>,
         #[extension_type] target: Target<Self>,
         args: SsimArgs,
     ) -> FloatTensor<Self>;
+}
 
-    fn adam(
-        param: FloatTensor<Self>,
-        grad: FloatTensor<Self>,
-        moment_1: FloatTensor<Self>,
-        moment_2: FloatTensor<Self>,
-        step: AdamStep,
-    ) -> AdamTensors<Self>;
+/// The gradient of [`PhotometricOps`].
+pub trait PhotometricBackend: PhotometricOps {
+    /// [`PhotometricOps::photometric`], and what its gradient needs.
+    fn photometric_tracked(
+        rendered: FloatTensor<Self>,
+        target: Target<Self>,
+        args: &SsimArgs,
+    ) -> (FloatTensor<Self>, FloatTensor<Self>);
 
-    fn screen_statistics(
-        gradient: FloatTensor<Self>,
-        packed: FloatTensor<Self>,
-        gradients: FloatTensor<Self>,
-        views: FloatTensor<Self>,
+    /// Gradient of the rendered images `[B, H, W, E]`, given what was kept and the gradient `[2]` of the losses.
+    fn photometric_backward(
+        rendered: FloatTensor<Self>,
+        target: Target<Self>,
+        kept: FloatTensor<Self>,
+        grad_losses: FloatTensor<Self>,
+        args: &SsimArgs,
+    ) -> FloatTensor<Self>;
+}
+
+/// [`ScreenStatistics::add`](crate::ScreenStatistics::add). Not differentiable.
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub trait ScreenStatisticsOps: Backend {
+    /// The sums with the lengths of `half * gradient` and the views added.
+    fn add_screen_statistics(
+        #[extension_type] inputs: ScreenStatisticsInputs<Self>,
         half: [f64; 2],
-    ) -> StatisticsTensors<Self>;
+    ) -> ScreenStatisticsOutputs<Self>;
 }
 
-/// Without autodiff an op is its forward, and nothing is kept.
-macro_rules! forward_only {
-    ($backend:ty) => {
-        impl SplatOps for $backend {
-            fn project(
-                means: FloatTensor<Self>,
-                quats: FloatTensor<Self>,
-                scales: FloatTensor<Self>,
-                viewmats: FloatTensor<Self>,
-                intrinsics: FloatTensor<Self>,
-                args: ProjectArgs,
-            ) -> FloatTensor<Self> {
-                Self::project_forward(means, quats, scales, viewmats, intrinsics, &args)
-            }
-
-            fn spherical_harmonics(
-                coeffs: FloatTensor<Self>,
-                dirs: FloatTensor<Self>,
-                degree: usize,
-            ) -> FloatTensor<Self> {
-                Self::spherical_harmonics_forward(coeffs, dirs, degree)
-            }
-
-            fn sh_colors(
-                sh0: FloatTensor<Self>,
-                sh_rest: Optional<Self>,
-                means: FloatTensor<Self>,
-                centers: FloatTensor<Self>,
-                seen: Optional<Self>,
-                settings: ShColorSettings,
-            ) -> FloatTensor<Self> {
-                let inputs = ShInputs {
-                    sh0,
-                    sh_rest: sh_rest.into_option(),
-                    means,
-                    centers,
-                    seen: seen.into_option(),
-                };
-                Self::sh_colors_forward(inputs, settings)
-            }
-
-            fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self> {
-                Self::activate(x, function)
-            }
-
-            fn screen_probe(
-                packed: FloatTensor<Self>,
-                _probe: FloatTensor<Self>,
-            ) -> FloatTensor<Self> {
-                packed
-            }
-
-            fn rasterize(
-                packed: FloatTensor<Self>,
-                colors: FloatTensor<Self>,
-                opacities: FloatTensor<Self>,
-                background: Optional<Self>,
-                args: RasterizeArgs,
-            ) -> FloatTensor<Self> {
-                Self::rasterize_forward(packed, colors, opacities, background.into_option(), &args)
-                    .0
-            }
-
-            fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self> {
-                <Self as SplatBackend>::gaussian_blur(image, &window)
-            }
-
-            fn ssim(
-                x: FloatTensor<Self>,
-                y: FloatTensor<Self>,
-                args: SsimArgs,
-            ) -> FloatTensor<Self> {
-                Self::ssim_forward([x, y], &args).0
-            }
-
-            fn photometric(
-                rendered: FloatTensor<Self>,
-                target: Target<Self>,
-                args: SsimArgs,
-            ) -> FloatTensor<Self> {
-                <Self as SplatBackend>::photometric(rendered, target, &args)
-            }
-
-            fn adam(
-                param: FloatTensor<Self>,
-                grad: FloatTensor<Self>,
-                moment_1: FloatTensor<Self>,
-                moment_2: FloatTensor<Self>,
-                step: AdamStep,
-            ) -> AdamTensors<Self> {
-                let [param, moment_1, moment_2] =
-                    <Self as SplatBackend>::adam([param, grad, moment_1, moment_2], &step);
-                AdamTensors {
-                    param,
-                    moment_1,
-                    moment_2,
-                }
-            }
-
-            fn screen_statistics(
-                gradient: FloatTensor<Self>,
-                packed: FloatTensor<Self>,
-                gradients: FloatTensor<Self>,
-                views: FloatTensor<Self>,
-                half: [f64; 2],
-            ) -> StatisticsTensors<Self> {
-                let tensors = [gradient, packed, gradients, views];
-                let [gradients, views] = Self::add_screen_statistics(tensors, half);
-                StatisticsTensors { gradients, views }
-            }
-        }
-    };
+/// [`adam_step`](crate::adam_step). Not differentiable.
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub trait AdamOps: Backend {
+    /// Parameter and moments after the step.
+    fn adam(#[extension_type] inputs: AdamInputs<Self>, step: AdamStep) -> AdamOutputs<Self>;
 }
 
-#[cfg(feature = "cpu")]
-forward_only!(burn::backend::Flex);
-#[cfg(feature = "cube")]
-forward_only!(burn_cubecl::CubeBackend);
+/// Everything that the ops need of a backend.
+pub trait SplatBackend:
+    ProjectBackend
+    + ScreenProbeOps
+    + SphericalHarmonicsBackend
+    + ShColorsBackend
+    + ActivationBackend
+    + RasterizeBackend
+    + BlurOps
+    + SsimBackend
+    + PhotometricBackend
+    + ScreenStatisticsOps
+    + AdamOps
+{
+}
+
+impl<B> SplatBackend for B where
+    B: ProjectBackend
+        + ScreenProbeOps
+        + SphericalHarmonicsBackend
+        + ShColorsBackend
+        + ActivationBackend
+        + RasterizeBackend
+        + BlurOps
+        + SsimBackend
+        + PhotometricBackend
+        + ScreenStatisticsOps
+        + AdamOps
+{
+}

@@ -2,9 +2,10 @@
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
+use tracing::trace_span;
 
 use crate::OpError;
-use crate::backend::SplatOps;
+use crate::backend::BlurOps;
 use crate::check::Checker;
 
 /// Convolves the rows and columns of images `[B, H, W, D]` with one symmetric window, taking zero
@@ -15,6 +16,7 @@ use crate::check::Checker;
 pub fn gaussian_blur(image: Tensor<4>, window: &[f64]) -> Result<Tensor<4>, OpError> {
     let check = Checker::new("gaussian_blur", "image", &image)?;
     check.window(window)?;
-    let blurred = <Dispatch as SplatOps>::gaussian_blur(image.into_dispatch(), window.to_vec());
+    let _span = trace_span!("blur").entered();
+    let blurred = Dispatch::gaussian_blur(image.into_dispatch(), window.to_vec());
     Ok(Tensor::from_dispatch(blurred))
 }

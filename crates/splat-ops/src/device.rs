@@ -1,4 +1,4 @@
-//! What else there is to do with a device. Most of it is for benchmarks of CubeCL devices: what they are, what the kernels
+//! Device utilities, mainly for benchmarks of CubeCL devices: what they are, what the kernels
 //! did there, how fast their memory is. Without such a device (or the features for one) there is nothing to tell.
 
 use burn::tensor::{Device, Tensor};
@@ -9,13 +9,13 @@ use crate::check::is_flex;
 use crate::{Projected, RasterizeSettings, RasterizeWork};
 pub use splat_core::memory::available_memory;
 
-/// What the kernels did since the process began, over all devices; a piece of work is a difference of two.
+/// Work of the kernels since the process began, over all devices; a piece of work is a difference of two.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct KernelWork {
     /// Kernels of ours that were launched; those of Burn are not seen here.
     pub launches: u64,
-    /// (Splat, tile) pairs that were listed.
-    pub instances: u64,
+    /// Intersections of splats and tiles that were listed.
+    pub intersections: u64,
     /// Bytes reserved for results and scratch of our kernels; the same memory may be reserved many times.
     pub reserved_bytes: u64,
     /// How often our kernels made the host wait for the device.
@@ -29,8 +29,8 @@ pub struct StepSizes {
     pub gaussians: u64,
     /// Those that reach into the view.
     pub visible: u64,
-    /// (Splat, tile) pairs.
-    pub instances: u64,
+    /// Intersections of splats and tiles.
+    pub intersections: u64,
     /// Width of the view in pixels.
     pub width: u64,
     /// Height of the view in pixels.
@@ -79,11 +79,11 @@ pub fn keep_awake(device: &Device) {
     }
 }
 
-/// What is known of a CubeCL device, and which variant of the kernels runs there: name and value, in an order for
+/// Properties of a CubeCL device, and which variant of the kernels runs there: name and value, in an order for
 /// reading. `None` for any other device.
-pub fn describe(device: &Device) -> Option<Vec<(&'static str, String)>> {
+pub fn device_info(device: &Device) -> Option<Vec<(&'static str, String)>> {
     #[cfg(feature = "cube")]
-    return client(device).map(|client| splat_kernels::describe(&client));
+    return client(device).map(|client| splat_kernels::device_info(&client));
     #[cfg(not(feature = "cube"))]
     {
         let _ = device;
@@ -103,14 +103,14 @@ pub fn reads_half(device: &Device) -> bool {
     }
 }
 
-/// What the kernels did so far.
+/// Work of the kernels so far.
 pub fn kernel_work() -> KernelWork {
     #[cfg(feature = "cube")]
     {
         let work = splat_kernels::work();
         KernelWork {
             launches: work.launches,
-            instances: work.instances,
+            intersections: work.intersections,
             reserved_bytes: work.reserved_bytes,
             waits: work.waits,
         }
@@ -120,12 +120,12 @@ pub fn kernel_work() -> KernelWork {
 }
 
 impl KernelWork {
-    /// What was done after `earlier`.
+    /// The difference to `earlier`.
     #[must_use]
     pub fn since(self, earlier: Self) -> Self {
         Self {
             launches: self.launches - earlier.launches,
-            instances: self.instances - earlier.instances,
+            intersections: self.intersections - earlier.intersections,
             reserved_bytes: self.reserved_bytes - earlier.reserved_bytes,
             waits: self.waits - earlier.waits,
         }
@@ -141,7 +141,7 @@ pub fn step_floor(device: &Device, sizes: &StepSizes) -> Option<Vec<(&'static st
         let sizes = splat_kernels::floor::Sizes {
             gaussians: sizes.gaussians,
             visible: sizes.visible,
-            instances: sizes.instances,
+            intersections: sizes.intersections,
             width: sizes.width,
             height: sizes.height,
             channels: 3,

@@ -1,4 +1,4 @@
-//! What can go wrong in an op, and how it gets past Burn's dispatch.
+//! Errors of the ops, and how they get past Burn's dispatch.
 
 use std::sync::{Arc, OnceLock};
 
@@ -28,7 +28,7 @@ pub enum OpError {
         tensor: &'static str,
         /// Its type.
         got: DType,
-        /// What is wrong with it.
+        /// Why it is refused.
         reason: &'static str,
     },
     /// An ordinary argument is out of range.
@@ -36,35 +36,35 @@ pub enum OpError {
     Argument {
         /// The op.
         op: &'static str,
-        /// What is wrong and what is allowed.
+        /// The fault, and the range allowed.
         what: String,
     },
     /// The splats touch more tiles than one call can list.
     #[error(
-        "{op}: {pairs} pairs of a tile and a splat that touches it; one call can list {limit}. \
+        "{op}: {intersections} intersections of a splat and a tile; one call can list {limit}. \
          Render fewer cameras or a smaller image per call, or remove Gaussians: huge ones first"
     )]
-    TooManyPairs {
+    TooManyIntersections {
         /// The op.
         op: &'static str,
-        /// Pairs of a tile and a splat that touches it.
-        pairs: u64,
+        /// Intersections of a splat and a tile.
+        intersections: u64,
         /// How many of them can be listed.
         limit: u64,
     },
     /// The lists of splats by tile need more memory than this process can get.
     #[error(
-        "{op}: {pairs} pairs of a tile and a splat that touches it need {needed} of memory, and {left} can be had. \
+        "{op}: {intersections} intersections of a splat and a tile need {needed} of memory, and {left} can be had. \
          Render a smaller image, fewer cameras per call, or remove Gaussians: huge ones first"
     )]
     OutOfMemory {
         /// The op.
         op: &'static str,
-        /// Pairs of a tile and a splat that touches it.
-        pairs: u64,
-        /// What they need, in words.
+        /// Intersections of a splat and a tile.
+        intersections: u64,
+        /// Memory needed, in words.
         needed: String,
-        /// What is left, in words.
+        /// Memory left, in words.
         left: String,
     },
     /// A kernel needs more buffers than the device lets it have.

@@ -44,8 +44,8 @@ mod ssim;
 #[cfg(all(test, feature = "cpu"))]
 mod tests;
 
-pub use activation::{Activation, exp, sigmoid};
-pub use adam::{AdamRows, AdamStep, adam_step};
+pub use activation::{exp, sigmoid};
+pub use adam::adam_step;
 pub use blur::gaussian_blur;
 #[cfg(feature = "cpu")]
 pub use cpu::RasterizeWork;
@@ -58,7 +58,10 @@ pub use photometric::{Photometric, Target, photometric};
 pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};
 pub use screen_statistics::ScreenStatistics;
-pub use settings::{ClampGradient, ImageSize, ProjectSettings, RasterizeSettings, ShColorSettings};
+pub use settings::{
+    Activation, AdamRows, AdamStep, ClampGradient, ImageSize, ProjectSettings, RasterizeSettings,
+    ShColorSettings, SsimArgs,
+};
 pub use sh_colors::sh_colors;
 pub use spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count, spherical_harmonics};
-pub use ssim::{SsimArgs, ssim_map};
+pub use ssim::ssim_map;

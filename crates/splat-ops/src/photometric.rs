@@ -2,13 +2,14 @@
 
 use burn::backend::Dispatch;
 use burn::tensor::{Int, Tensor};
+use tracing::trace_span;
 
 use crate::OpError;
-use crate::backend::{self, SplatOps};
+use crate::backend::{self, PhotometricOps};
 use crate::check::Checker;
-use crate::ssim::SsimArgs;
+use crate::settings::SsimArgs;
 
-/// What [`photometric`] compares with, `[B, H, W, D]`.
+/// Images that [`photometric`] compares with, `[B, H, W, D]`.
 #[derive(Debug, Clone)]
 pub enum Target {
     /// 8-bit levels, 0 to 255, that stand for `level / 255`. Of type U8 they are read as they are, on GPUs of type I32 too.
@@ -29,7 +30,7 @@ impl From<Tensor<4>> for Target {
     }
 }
 
-/// What [`photometric`] measures.
+/// Losses that [`photometric`] measures.
 #[derive(Debug, Clone)]
 pub struct Photometric {
     losses: Tensor<1>,
@@ -96,8 +97,8 @@ pub fn photometric(
             backend::Target::Values(values.into_dispatch())
         }
     };
-    let losses =
-        <Dispatch as SplatOps>::photometric(rendered.into_dispatch(), target, args.clone());
+    let _span = trace_span!("photometric").entered();
+    let losses = Dispatch::photometric(rendered.into_dispatch(), target, args.clone());
     Ok(Photometric {
         losses: Tensor::from_dispatch(losses),
     })

@@ -2,8 +2,9 @@
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
+use tracing::trace_span;
 
-use crate::backend::{PROJECTED_WIDTH, SplatOps};
+use crate::backend::{OpInputs, PROJECTED_WIDTH, ProjectOps, ProjectTensors, ScreenProbeOps};
 use crate::check::Checker;
 use crate::settings::ProjectArgs;
 use crate::{ImageSize, OpError, ProjectSettings};
@@ -80,10 +81,8 @@ impl Projected {
     /// memory of the splats, and its gradient in that of theirs: nothing is copied.
     pub fn with_screen_probe(self) -> (Self, Tensor<3>) {
         let probe = self.packed.clone().detach().require_grad();
-        let packed = <Dispatch as SplatOps>::screen_probe(
-            self.packed.into_dispatch(),
-            probe.clone().into_dispatch(),
-        );
+        let packed =
+            Dispatch::screen_probe(self.packed.into_dispatch(), probe.clone().into_dispatch());
         let probed = Self {
             packed: Tensor::from_dispatch(packed),
             size: self.size,
@@ -136,17 +135,19 @@ pub fn project(
         return Err(check.argument("needs at least one camera".into()));
     }
 
-    let packed = <Dispatch as SplatOps>::project(
-        means.into_dispatch(),
-        quats.into_dispatch(),
-        scales.into_dispatch(),
-        viewmats.into_dispatch(),
-        intrinsics.into_dispatch(),
-        ProjectArgs {
-            size,
-            settings: *settings,
-        },
-    );
+    let inputs = OpInputs(ProjectTensors {
+        means: means.into_dispatch(),
+        quats: quats.into_dispatch(),
+        scales: scales.into_dispatch(),
+        viewmats: viewmats.into_dispatch(),
+        intrinsics: intrinsics.into_dispatch(),
+    });
+    let args = ProjectArgs {
+        size,
+        settings: *settings,
+    };
+    let _span = trace_span!("project").entered();
+    let packed = Dispatch::project(inputs, args);
     Ok(Projected {
         packed: Tensor::from_dispatch(packed),
         size,

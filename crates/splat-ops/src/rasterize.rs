@@ -4,8 +4,9 @@ use std::sync::OnceLock;
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
+use tracing::trace_span;
 
-use crate::backend::{Optional, SplatOps};
+use crate::backend::{OpInputs, RasterizeOps, RasterizeTensors};
 use crate::check::Checker;
 use crate::settings::RasterizeArgs;
 use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
@@ -71,7 +72,7 @@ impl Rendered {
 ///
 /// # Errors
 /// When shapes, types or devices do not fit, when a setting is out of range, when the splats touch more tiles than one call
-/// can list ([`OpError::TooManyPairs`]), and when the device fails.
+/// can list ([`OpError::TooManyIntersections`]), and when the device fails.
 pub fn rasterize<const DC: usize, const DO: usize>(
     projected: &Projected,
     colors: Tensor<DC>,
@@ -94,21 +95,21 @@ pub fn rasterize<const DC: usize, const DO: usize>(
     }
 
     let errors = ErrorSlot::default();
-    let packed = <Dispatch as SplatOps>::rasterize(
-        packed.into_dispatch(),
-        colors.into_dispatch(),
-        opacities.into_dispatch(),
-        match background {
-            Some(color) => Optional::Some(color.into_dispatch()),
-            None => Optional::None,
-        },
-        RasterizeArgs {
-            size: projected.image_size(),
-            settings: *settings,
-            backward: false,
-            errors: errors.clone(),
-        },
-    );
+    let inputs = OpInputs(RasterizeTensors {
+        packed: packed.into_dispatch(),
+        colors: colors.into_dispatch(),
+        opacities: opacities.into_dispatch(),
+        background: background.map(Tensor::into_dispatch),
+    });
+    let args = RasterizeArgs {
+        size: projected.image_size(),
+        settings: *settings,
+        backward: false,
+        errors: errors.clone(),
+    };
+    let span = trace_span!("rasterize").entered();
+    let packed = Dispatch::rasterize(inputs, args);
+    drop(span);
     if let Some(error) = errors.error() {
         return Err(error.clone());
     }
@@ -141,7 +142,7 @@ pub(crate) fn check_settings(settings: &RasterizeSettings) -> Result<(), OpError
     })
 }
 
-/// What is the same for all of `cameras`, once for each. For one camera there is nothing to repeat, and nothing to sum in
+/// One tensor for all `cameras`, repeated for each. For one camera there is nothing to repeat, and nothing to sum in
 /// the gradient.
 fn repeat<const R: usize>(one: Tensor<R>, cameras: usize) -> Tensor<R> {
     match cameras {

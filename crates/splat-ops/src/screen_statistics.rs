@@ -1,9 +1,9 @@
-//! What density control wants to know of every step (3DGS section 5.2).
+//! Statistics of every step for density control (3DGS section 5.2).
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 
-use crate::backend::{PROJECTED_WIDTH, SplatOps};
+use crate::backend::{OpInputs, PROJECTED_WIDTH, ScreenStatisticsOps, ScreenStatisticsTensors};
 use crate::check::Checker;
 use crate::{OpError, Projected};
 
@@ -37,13 +37,13 @@ impl ScreenStatistics {
         // Pixels to half images, and the mean over cameras to a sum.
         let size = projected.image_size();
         let half = [size.width, size.height].map(|side| f64::from(side) / 2.0 * c as f64);
-        let sums = <Dispatch as SplatOps>::screen_statistics(
-            gradient.into_dispatch(),
-            packed.into_dispatch(),
-            self.gradients.into_dispatch(),
-            self.views.into_dispatch(),
-            half,
-        );
+        let inputs = OpInputs(ScreenStatisticsTensors {
+            gradient: gradient.into_dispatch(),
+            packed: packed.into_dispatch(),
+            gradients: self.gradients.into_dispatch(),
+            views: self.views.into_dispatch(),
+        });
+        let sums = Dispatch::add_screen_statistics(inputs, half);
         Ok(Self {
             gradients: Tensor::from_dispatch(sums.gradients),
             views: Tensor::from_dispatch(sums.views),

@@ -1,7 +1,8 @@
 //! Sizes and settings of the ops. Every constant of the method is a field here, with its default.
 
 pub use splat_core::{
-    ClampGradient, ImageSize, ProjectSettings, RasterizeSettings, ShColorSettings,
+    Activation, AdamRows, AdamStep, ClampGradient, ImageSize, ProjectSettings, RasterizeSettings,
+    ShColorSettings, SsimArgs,
 };
 
 use crate::ErrorSlot;

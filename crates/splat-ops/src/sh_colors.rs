@@ -2,8 +2,9 @@
 
 use burn::backend::Dispatch;
 use burn::tensor::{DType, Tensor};
+use tracing::trace_span;
 
-use crate::backend::{Optional, PROJECTED_WIDTH, SplatOps};
+use crate::backend::{OpInputs, PROJECTED_WIDTH, ShColorTensors, ShColorsOps};
 use crate::check::Checker;
 use crate::device::reads_half;
 use crate::{OpError, Projected, SH_DEGREE_MAX, ShColorSettings, sh_coefficient_count};
@@ -70,23 +71,19 @@ pub fn sh_colors(
             let (packed, c) = (seen.packed(), centers.dims()[0]);
             let expected = [Some(c), Some(n), Some(PROJECTED_WIDTH)];
             check.tensor("seen", &packed, expected, "[C, N, 9]")?;
-            Optional::Some(packed.into_dispatch())
+            Some(packed.into_dispatch())
         }
-        None => Optional::None,
+        None => None,
     };
-    let rest = match sh_rest {
-        Some(rest) if degree > 0 => Optional::Some(rest.into_dispatch()),
-        _ => Optional::None,
-    };
-    let colors = <Dispatch as SplatOps>::sh_colors(
-        sh0.into_dispatch(),
-        rest,
-        means.into_dispatch(),
-        centers.into_dispatch(),
+    let inputs = OpInputs(ShColorTensors {
+        sh0: sh0.into_dispatch(),
+        sh_rest: sh_rest.filter(|_| degree > 0).map(Tensor::into_dispatch),
+        means: means.into_dispatch(),
+        centers: centers.into_dispatch(),
         seen,
-        settings,
-    );
-    Ok(Tensor::from_dispatch(colors))
+    });
+    let _span = trace_span!("colours").entered();
+    Ok(Tensor::from_dispatch(Dispatch::sh_colors(inputs, settings)))
 }
 
 /// Coefficients as the device of the op reads them: those in half precision as they are where its kernels can, and

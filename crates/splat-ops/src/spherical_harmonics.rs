@@ -2,11 +2,12 @@
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
+use tracing::trace_span;
 
 pub use splat_core::{SH_DEGREE_MAX, sh_coefficient_count};
 
 use crate::OpError;
-use crate::backend::SplatOps;
+use crate::backend::{OpInputs, SphericalHarmonicsOps, SphericalHarmonicsTensors};
 use crate::check::Checker;
 
 /// Evaluates real spherical harmonics in C x N directions.
@@ -42,10 +43,11 @@ pub fn spherical_harmonics(
             sh_coefficient_count(degree)
         )));
     }
-    let colors = <Dispatch as SplatOps>::spherical_harmonics(
-        coeffs.into_dispatch(),
-        dirs.into_dispatch(),
-        degree,
-    );
+    let inputs = OpInputs(SphericalHarmonicsTensors {
+        coeffs: coeffs.into_dispatch(),
+        dirs: dirs.into_dispatch(),
+    });
+    let _span = trace_span!("spherical harmonics").entered();
+    let colors = Dispatch::spherical_harmonics(inputs, degree);
     Ok(Tensor::from_dispatch(colors))
 }

@@ -4,21 +4,12 @@ use core::ops::Range;
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
+use tracing::trace_span;
 
 use crate::OpError;
-use crate::backend::SplatOps;
+use crate::backend::{OpInputs, SsimOps, SsimTensors};
 use crate::check::Checker;
-
-/// Window and constants of [`ssim_map`].
-#[derive(Debug, Clone, PartialEq)]
-pub struct SsimArgs {
-    /// Weights along one axis, symmetric, of odd length.
-    pub window: Vec<f64>,
-    /// Constant of the luminance term.
-    pub c1: f64,
-    /// Constant of the contrast term.
-    pub c2: f64,
-}
+use crate::settings::SsimArgs;
 
 /// Structural similarity of two images `[B, H, W, D]` at every pixel and channel, `[B, H, W, D]`, zeros outside of
 /// the images:
@@ -35,8 +26,12 @@ pub fn ssim_map(x: Tensor<4>, y: Tensor<4>, args: &SsimArgs) -> Result<Tensor<4>
     let check = Checker::new("ssim_map", "x", &x)?;
     check.tensor("y", &y, x.dims().map(Some), "that of `x`")?;
     check.window(&args.window)?;
-    let map = <Dispatch as SplatOps>::ssim(x.into_dispatch(), y.into_dispatch(), args.clone());
-    Ok(Tensor::from_dispatch(map))
+    let inputs = OpInputs(SsimTensors {
+        x: x.into_dispatch(),
+        y: y.into_dispatch(),
+    });
+    let _span = trace_span!("ssim").entered();
+    Ok(Tensor::from_dispatch(Dispatch::ssim(inputs, args.clone())))
 }
 
 /// The rows and columns of the pixels of an image of `[height, width]` whose window lies inside; all of them where there

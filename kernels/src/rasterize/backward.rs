@@ -1,22 +1,22 @@
-//! The gradient of every (tile, splat) pair, back to front; `sums.rs` has what becomes of it.
+//! The gradient of every intersection, back to front; `sums.rs` has what becomes of it.
 //!
 //! With g = dL/dsigma of one pixel, all gradients of a splat's shape follow from six sums over pixels:
 //! ```text
 //! A = Σ g,  B = Σ g z1,  C = Σ g z2,  D = Σ g z1 dx,  E = Σ g z2 dx,  F = Σ g z2 dy
 //! dL/dw11 = D,  dL/dw21 = E,  dL/dw22 = F,  dL/dmean = -(w11 B + w21 C, w22 C),  dL/do = -A / o
 //! ```
-//! Each block sums its pixels, and the tile its blocks (in order). One value of a pair goes to its slot, or is added to
-//! the splat's gradient at once.
+//! Each block sums its pixels, and the tile its blocks (in order). One value of an intersection goes to its slot, or
+//! is added to the splat's gradient at once.
 //!
 //! Floor per (block, splat) pair: as forward, plus 24 bytes and 4 per channel to shared memory; per pixel of the block
-//! about 45 operations and 4 per channel. Per (tile, splat) pair: 32 bytes and 4 per channel from memory (28 without
+//! about 45 operations and 4 per channel. Per intersection: 32 bytes and 4 per channel from memory (28 without
 //! slots), and what `sums.rs` counts.
 
 use cubecl::prelude::*;
 
 use super::pair::{SHAPE, Shape, Thresholds, UNSEEN, sample};
 use super::sums::{Sums, Target, TargetExpand, add_to_splat};
-use super::tile::{BATCH, Batch, Plan, WORDS, pixel_index, place};
+use super::tile::{BATCH, Batch, Place, Plan, WORDS, pixel_index, place};
 use crate::intersect::Grid;
 
 /// Gradients of a splat's shape and opacity in a slot, in the order of [`SHAPE`]; those of colours follow.
@@ -47,7 +47,8 @@ impl SlotLayout {
         if self.shape { SHAPE_GRADIENTS } else { 0 }
     }
 
-    /// Floats in shared memory beside the partial sums: the batch, its targets and bits, and how far the blocks have walked.
+    /// Floats in shared memory beside the partial sums: the batch, its targets and bits, and how far the blocks have
+    /// walked.
     fn batch(self, plan: Plan) -> usize {
         BATCH * (SHAPE + self.width) + 2 * BATCH + plan.blocks() * (WORDS + 1) + 2
     }
@@ -61,8 +62,324 @@ impl SlotLayout {
     }
 }
 
-/// Gradients of every (tile, splat) pair: one workgroup per tile, back to front. They go to `target`, to splats as `sums`
+/// The pixels of a unit.
+#[derive(CubeType)]
+struct Pixels {
+    /// Transmittance behind the splats that are still to come.
+    t: Array<f32>,
+    /// Their light and the background's, times the gradient.
+    behind: Array<f32>,
+    /// How many splats of the list the pixel has walked.
+    last: Array<u32>,
+    /// Gradient of the pixel's colour, channel by channel.
+    g: Array<f32>,
+}
+
+#[cube]
+impl Pixels {
+    /// The pixels, and what they have walked to the `ends` of the blocks and the `longest` of the tile.
+    fn load(
+        background: &ComptimeOption<&[f32]>,
+        transmittance: &[f32],
+        walked: &[u32],
+        grad_output: &[f32],
+        ends: &Shared<[Atomic<u32>]>,
+        longest: &Shared<[Atomic<u32>]>,
+        grid: Grid,
+        place: Place,
+        channels: u32,
+        first_channel: u32,
+        #[comptime] plan: Plan,
+        #[comptime] width: usize,
+        #[comptime] first_launch: bool,
+    ) -> Pixels {
+        let pixels = comptime!(plan.pixels());
+        let mut t = Array::<f32>::new(pixels);
+        let mut behind = Array::<f32>::new(pixels);
+        let mut last = Array::<u32>::new(pixels);
+        let mut g = Array::<f32>::new(comptime!(pixels * width));
+        #[unroll]
+        for q in 0..pixels {
+            let (x, y) = place.pixel(q, plan);
+            let (inside, pixel) = pixel_index(grid, place, x, y);
+            t[q] = 1.0f32;
+            behind[q] = 0.0f32;
+            last[q] = 0u32;
+            #[unroll]
+            for channel in 0..width {
+                g[q * width + channel] = 0.0f32;
+            }
+            if inside {
+                let from = pixel * (channels as usize + 1) + first_channel as usize;
+                let end = transmittance[pixel];
+                t[q] = end;
+                last[q] = walked[pixel];
+                let mut seen = 0.0f32;
+                #[unroll]
+                for channel in 0..width {
+                    let value = grad_output[from + channel];
+                    g[q * width + channel] = value;
+                    #[comptime]
+                    if let ComptimeOption::Some(background) = background {
+                        let at = (place.camera * channels + first_channel) as usize + channel;
+                        seen += value * background[at];
+                    }
+                }
+                if comptime!(first_launch) {
+                    seen -= grad_output[from + channels as usize];
+                }
+                behind[q] = end * seen;
+                Atomic::fetch_max(&ends[place.block as usize], last[q]);
+                Atomic::fetch_max(&longest[0], last[q]);
+            }
+        }
+        Pixels { t, behind, last, g }
+    }
+
+    /// Sums over the pixels of the gradients of the splat that begins at `at`, whose place in the list is `entry`; the
+    /// pixels then stand before it.
+    fn gradients(
+        &mut self,
+        splats: &Shared<[f32]>,
+        at: usize,
+        entry: u32,
+        place: Place,
+        thresholds: Thresholds,
+        #[comptime] plan: Plan,
+        #[comptime] layout: SlotLayout,
+    ) -> Array<f32> {
+        let width = comptime!(layout.width);
+        let shape = Shape::load(splats, at);
+        let mut color = Array::<f32>::new(width);
+        #[unroll]
+        for channel in 0..width {
+            color[channel] = splats[at + SHAPE + channel];
+        }
+        let mut color_sums = Array::<f32>::new(width);
+        #[unroll]
+        for channel in 0..width {
+            color_sums[channel] = 0.0f32;
+        }
+        let mut sum = 0.0f32;
+        let mut sum_z1 = 0.0f32;
+        let mut sum_z2 = 0.0f32;
+        let mut sum_z1_dx = 0.0f32;
+        let mut sum_z2_dx = 0.0f32;
+        let mut sum_z2_dy = 0.0f32;
+        #[unroll]
+        for q in 0..comptime!(plan.pixels()) {
+            let (x, y) = place.pixel(q, plan);
+            let s = sample(shape, x as f32 + 0.5f32, y as f32 + 0.5f32);
+            let raw = select(entry < self.last[q], s.raw, UNSEEN);
+            let seen = thresholds.seen(raw);
+            let alpha = select(seen, thresholds.alpha(raw), 0.0f32);
+            let clear = 1.0f32 - alpha;
+            let before = self.t[q] / clear;
+            let weight = alpha * before;
+            let mut dot = 0.0f32;
+            #[unroll]
+            for channel in 0..width {
+                let value = self.g[q * width + channel];
+                dot += color[channel] * value;
+                if comptime!(layout.colors) {
+                    color_sums[channel] += weight * value;
+                }
+            }
+            if comptime!(layout.shape) {
+                let g_alpha = before * dot - self.behind[q] / clear;
+                let g_sigma = select(thresholds.capped(raw), 0.0f32, -g_alpha * raw);
+                let g_sigma = select(seen, g_sigma, 0.0f32);
+                // Far from the splat a broken one may overflow.
+                let g_z1 = g_sigma * select(seen, s.z1, 0.0f32);
+                let g_z2 = g_sigma * select(seen, s.z2, 0.0f32);
+                sum += g_sigma;
+                sum_z1 += g_z1;
+                sum_z2 += g_z2;
+                sum_z1_dx += g_z1 * s.dx;
+                sum_z2_dx += g_z2 * s.dx;
+                sum_z2_dy += g_z2 * s.dy;
+            }
+            self.behind[q] += weight * dot;
+            self.t[q] = before;
+        }
+
+        let mut parts = Array::<f32>::new(comptime!(layout.values()));
+        if comptime!(layout.shape) {
+            // d = pixel - mean
+            parts[0] = -(shape.w11 * sum_z1 + shape.w21 * sum_z2);
+            parts[1] = -(shape.w22 * sum_z2);
+            parts[2] = sum_z1_dx;
+            parts[3] = sum_z2_dx;
+            parts[4] = sum_z2_dy;
+            parts[5] = -sum / shape.opacity;
+        }
+        if comptime!(layout.colors) {
+            #[unroll]
+            for channel in 0..width {
+                parts[comptime!(layout.first_color()) + channel] = color_sums[channel];
+            }
+        }
+        parts
+    }
+}
+
+/// First entry of the list of the workgroup's tile, the same in all units, which have waited for each other.
+#[cube]
+fn first_of_tile(ranges: &[u32], grid: Grid, place: Place) -> u32 {
+    let mut start = Shared::new_slice(1usize);
+    if UNIT_POS == 0 {
+        let mut first = 0u32;
+        if place.tile < grid.tiles {
+            first = ranges[place.tile as usize * 2];
+        }
+        start[0] = first;
+    }
+    sync_cube();
+    workgroup_uniform_load(&start[0])
+}
+
+/// Reads the splats of a batch and their targets; place k of it holds entry `remaining - 1 - k`.
+#[cube]
+fn load_batch<A: Numeric>(
+    batch: &mut Batch,
+    targets: &mut Shared<[u32]>,
+    target: &Target<A>,
+    packed: &[f32],
+    colors: &[f32],
+    opacities: &[f32],
+    splats: &[u32],
+    start: u32,
+    remaining: u32,
+    count: u32,
+    ends: &[Atomic<u32>],
+    channels: usize,
+    first_channel: usize,
+    grid: Grid,
+    place: Place,
+    #[comptime] plan: Plan,
+    #[comptime] width: usize,
+) {
+    let mut k = UNIT_POS;
+    while k < count {
+        let entry = remaining - 1u32 - k;
+        let at = (start + entry) as usize;
+        let splat = splats[at] as usize;
+        let color = splat * channels + first_channel;
+        #[comptime]
+        let to = match target {
+            Target::Slots(slots) => slots.of[at],
+            Target::Splats(_) => splats[at],
+        };
+        targets[k as usize] = to;
+        batch.load(
+            packed, colors, opacities, splat, color, k as usize, entry, ends, grid, place, plan,
+            width,
+        );
+        k += comptime!(plan.units() as u32);
+    }
+}
+
+/// The pixels walk the splats of a group that meet their block; the block's sums of each go to `partials`.
+#[cube]
+fn walk_group(
+    pixels: &mut Pixels,
+    batch: &Batch,
+    partials: &mut Shared<[f32]>,
+    from: u32,
+    remaining: u32,
+    place: Place,
+    thresholds: Thresholds,
+    #[comptime] plan: Plan,
+    #[comptime] layout: SlotLayout,
+) {
+    let values = comptime!(layout.values());
+    let group = comptime!(layout.group(plan));
+    let width = comptime!(layout.width);
+    let blocks = comptime!(plan.blocks());
+    let mask = comptime!(u32::MAX >> (32 - group as u32));
+    let mut bits = batch.bits(place.block, from as usize / 32) >> (from % 32u32) & mask;
+    while bits != 0u32 {
+        let in_group = bits.trailing_zeros();
+        bits &= bits - 1u32;
+        let k = (from + in_group) as usize;
+        let entry = remaining - 1u32 - k as u32;
+        let at = k * comptime!(SHAPE + width);
+        let mut parts = pixels.gradients(&batch.splats, at, entry, place, thresholds, plan, layout);
+        // All units of a plane are here together: they walk the same block.
+        if comptime!(plan.lanes() > 1) {
+            #[unroll]
+            for value in 0..values {
+                parts[value] = plane_sum(parts[value]);
+            }
+        }
+        if place.lane == 0 {
+            let to = in_group as usize * comptime!(values * blocks);
+            #[unroll]
+            for value in 0..values {
+                partials[to + value * blocks + place.block as usize] = parts[value];
+            }
+        }
+    }
+}
+
+/// One unit sums one value of one splat of a group over the blocks that have walked it; the sum goes to `target`.
+#[cube]
+fn sum_group<A: Numeric>(
+    target: &mut Target<A>,
+    targets: &Shared<[u32]>,
+    batch: &Batch,
+    partials: &Shared<[f32]>,
+    from: u32,
+    count: u32,
+    channels: usize,
+    first_channel: usize,
+    #[comptime] plan: Plan,
+    #[comptime] layout: SlotLayout,
+    #[comptime] sums: Sums,
+) {
+    let values = comptime!(layout.values());
+    let group = comptime!(layout.group(plan));
+    let blocks = comptime!(plan.blocks());
+    let mut row = UNIT_POS as usize;
+    while row < comptime!(group * values) {
+        let k = from as usize + row / values;
+        if k < count as usize {
+            let to = targets[k] as usize;
+            let mut touched = batch.touched[k];
+            let walked = touched != 0u32;
+            let mut sum = 0.0f32;
+            while touched != 0u32 {
+                sum += partials[row * blocks + touched.trailing_zeros() as usize];
+                touched &= touched - 1u32;
+            }
+            #[comptime]
+            match target {
+                Target::Slots(slots) => {
+                    slots.gradients[to * values + row % values] = sum;
+                }
+                Target::Splats(gradients) => {
+                    if walked {
+                        add_to_splat(
+                            gradients,
+                            to,
+                            row % values,
+                            sum,
+                            channels,
+                            first_channel,
+                            layout,
+                            sums,
+                        );
+                    }
+                }
+            }
+        }
+        row += comptime!(plan.units());
+    }
+}
+
+/// Gradients of every intersection: one workgroup per tile, back to front. They go to `target`, to splats as `sums`
 /// says.
+// Longer than a hundred lines by its arguments and those of the steps that it calls.
 #[cube(launch)]
 pub(super) fn rasterize_backward<A: Numeric>(
     packed: &[f32],
@@ -87,27 +404,19 @@ pub(super) fn rasterize_backward<A: Numeric>(
     let values = comptime!(layout.values());
     let group = comptime!(layout.group(plan));
     let width = comptime!(layout.width);
-    let pixels = comptime!(plan.pixels());
-    let units = comptime!(plan.units());
     let blocks = comptime!(plan.blocks());
 
     let mut batch = Batch::new(plan, width);
-    // Of every splat of the batch: its slot, or without slots its index.
+    // Slot of every splat of the batch; without slots its index.
     let mut targets = Shared::new_slice(BATCH);
     // Place k of the group, value, block.
     let mut partials = Shared::new_slice(comptime!(group * values * blocks));
-    let mut start = Shared::new_slice(1usize);
     // How far the pixels of every block have walked, and those of the tile.
     let ends = Shared::<[Atomic<u32>]>::new_slice(blocks);
     let longest = Shared::<[Atomic<u32>]>::new_slice(1usize);
     let place = place(grid, plan);
 
     if UNIT_POS == 0 {
-        let mut first = 0u32;
-        if place.tile < grid.tiles {
-            first = ranges[place.tile as usize * 2];
-        }
-        start[0] = first;
         Atomic::store(&longest[0], 0u32);
     }
     if place.lane == 0 {
@@ -115,47 +424,22 @@ pub(super) fn rasterize_backward<A: Numeric>(
     }
     sync_cube();
 
-    let mut t = Array::<f32>::new(pixels);
-    let mut behind = Array::<f32>::new(pixels);
-    let mut last = Array::<u32>::new(pixels);
-    let mut g = Array::<f32>::new(comptime!(pixels * width));
-    #[unroll]
-    for q in 0..pixels {
-        let (x, y) = place.pixel(q, plan);
-        let (inside, pixel) = pixel_index(grid, place, x, y);
-        t[q] = 1.0f32;
-        behind[q] = 0.0f32;
-        last[q] = 0u32;
-        #[unroll]
-        for channel in 0..width {
-            g[q * width + channel] = 0.0f32;
-        }
-        if inside {
-            let from = pixel * (channels as usize + 1) + first_channel as usize;
-            let end = transmittance[pixel];
-            t[q] = end;
-            last[q] = walked[pixel];
-            let mut seen = 0.0f32;
-            #[unroll]
-            for channel in 0..width {
-                let value = grad_output[from + channel];
-                g[q * width + channel] = value;
-                #[comptime]
-                if let ComptimeOption::Some(background) = &background {
-                    let at = (place.camera * channels + first_channel) as usize + channel;
-                    seen += value * background[at];
-                }
-            }
-            if comptime!(first_launch) {
-                seen -= grad_output[from + channels as usize];
-            }
-            behind[q] = end * seen;
-            Atomic::fetch_max(&ends[place.block as usize], last[q]);
-            Atomic::fetch_max(&longest[0], last[q]);
-        }
-    }
-    sync_cube();
-    let start = workgroup_uniform_load(&start[0]);
+    let mut pixels = Pixels::load(
+        &background,
+        transmittance,
+        walked,
+        grad_output,
+        &ends,
+        &longest,
+        grid,
+        place,
+        channels,
+        first_channel,
+        plan,
+        width,
+        first_launch,
+    );
+    let start = first_of_tile(ranges, grid, place);
     let mut remaining = workgroup_uniform_load_atomic(&longest[0]);
 
     // Batches from the back; place k of a batch holds entry remaining - 1 - k.
@@ -163,158 +447,54 @@ pub(super) fn rasterize_backward<A: Numeric>(
         let count = min(comptime!(BATCH as u32), remaining);
         batch.clear(plan);
         sync_cube();
-        let mut k = UNIT_POS;
-        while k < count {
-            let entry = remaining - 1u32 - k;
-            let at = (start + entry) as usize;
-            let splat = splats[at] as usize;
-            let color = splat * channels as usize + first_channel as usize;
-            #[comptime]
-            let to = match &target {
-                Target::Slots(slots) => slots.of[at],
-                Target::Splats(_) => splats[at],
-            };
-            targets[k as usize] = to;
-            batch.load(
-                packed, colors, opacities, splat, color, k as usize, entry, &ends, grid, place,
-                plan, width,
-            );
-            k += comptime!(units as u32);
-        }
+        load_batch(
+            &mut batch,
+            &mut targets,
+            &target,
+            packed,
+            colors,
+            opacities,
+            splats,
+            start,
+            remaining,
+            count,
+            &ends,
+            channels as usize,
+            first_channel as usize,
+            grid,
+            place,
+            plan,
+            width,
+        );
         sync_cube();
 
         let mut from = 0u32;
         while from < count {
-            let mask = comptime!(u32::MAX >> (32 - group as u32));
-            let mut bits = batch.bits(place.block, from as usize / 32) >> (from % 32u32) & mask;
-            while bits != 0u32 {
-                let in_group = bits.trailing_zeros();
-                bits &= bits - 1u32;
-                let k = (from + in_group) as usize;
-                let entry = remaining - 1u32 - k as u32;
-                let at = k * comptime!(SHAPE + width);
-                let shape = Shape::load(&batch.splats, at);
-                let mut color = Array::<f32>::new(width);
-                #[unroll]
-                for channel in 0..width {
-                    color[channel] = batch.splats[at + SHAPE + channel];
-                }
-                let mut color_sums = Array::<f32>::new(width);
-                #[unroll]
-                for channel in 0..width {
-                    color_sums[channel] = 0.0f32;
-                }
-                let mut sum = 0.0f32;
-                let mut sum_z1 = 0.0f32;
-                let mut sum_z2 = 0.0f32;
-                let mut sum_z1_dx = 0.0f32;
-                let mut sum_z2_dx = 0.0f32;
-                let mut sum_z2_dy = 0.0f32;
-                #[unroll]
-                for q in 0..pixels {
-                    let (x, y) = place.pixel(q, plan);
-                    let s = sample(shape, x as f32 + 0.5f32, y as f32 + 0.5f32);
-                    let raw = select(entry < last[q], s.raw, UNSEEN);
-                    let seen = thresholds.seen(raw);
-                    let alpha = select(seen, thresholds.alpha(raw), 0.0f32);
-                    let clear = 1.0f32 - alpha;
-                    let before = t[q] / clear;
-                    let weight = alpha * before;
-                    let mut dot = 0.0f32;
-                    #[unroll]
-                    for channel in 0..width {
-                        let value = g[q * width + channel];
-                        dot += color[channel] * value;
-                        if comptime!(layout.colors) {
-                            color_sums[channel] += weight * value;
-                        }
-                    }
-                    if comptime!(layout.shape) {
-                        let g_alpha = before * dot - behind[q] / clear;
-                        let g_sigma = select(thresholds.capped(raw), 0.0f32, -g_alpha * raw);
-                        let g_sigma = select(seen, g_sigma, 0.0f32);
-                        // Far from the splat a broken one may overflow.
-                        let g_z1 = g_sigma * select(seen, s.z1, 0.0f32);
-                        let g_z2 = g_sigma * select(seen, s.z2, 0.0f32);
-                        sum += g_sigma;
-                        sum_z1 += g_z1;
-                        sum_z2 += g_z2;
-                        sum_z1_dx += g_z1 * s.dx;
-                        sum_z2_dx += g_z2 * s.dx;
-                        sum_z2_dy += g_z2 * s.dy;
-                    }
-                    behind[q] += weight * dot;
-                    t[q] = before;
-                }
-
-                let mut parts = Array::<f32>::new(values);
-                if comptime!(layout.shape) {
-                    // d = pixel - mean
-                    parts[0] = -(shape.w11 * sum_z1 + shape.w21 * sum_z2);
-                    parts[1] = -(shape.w22 * sum_z2);
-                    parts[2] = sum_z1_dx;
-                    parts[3] = sum_z2_dx;
-                    parts[4] = sum_z2_dy;
-                    parts[5] = -sum / shape.opacity;
-                }
-                if comptime!(layout.colors) {
-                    #[unroll]
-                    for channel in 0..width {
-                        parts[comptime!(layout.first_color()) + channel] = color_sums[channel];
-                    }
-                }
-                // All units of a plane are here together: they walk the same block.
-                if comptime!(plan.lanes() > 1) {
-                    #[unroll]
-                    for value in 0..values {
-                        parts[value] = plane_sum(parts[value]);
-                    }
-                }
-                if place.lane == 0 {
-                    let to = in_group as usize * comptime!(values * blocks);
-                    #[unroll]
-                    for value in 0..values {
-                        partials[to + value * blocks + place.block as usize] = parts[value];
-                    }
-                }
-            }
+            walk_group(
+                &mut pixels,
+                &batch,
+                &mut partials,
+                from,
+                remaining,
+                place,
+                thresholds,
+                plan,
+                layout,
+            );
             sync_cube();
-            // One unit sums one value of one splat over the blocks that have walked it.
-            let mut row = UNIT_POS as usize;
-            while row < comptime!(group * values) {
-                let k = from as usize + row / values;
-                if k < count as usize {
-                    let to = targets[k] as usize;
-                    let mut touched = batch.touched[k];
-                    let walked = touched != 0u32;
-                    let mut sum = 0.0f32;
-                    while touched != 0u32 {
-                        sum += partials[row * blocks + touched.trailing_zeros() as usize];
-                        touched &= touched - 1u32;
-                    }
-                    #[comptime]
-                    match &mut target {
-                        Target::Slots(slots) => {
-                            slots.gradients[to * values + row % values] = sum;
-                        }
-                        Target::Splats(gradients) => {
-                            if walked {
-                                add_to_splat(
-                                    gradients,
-                                    to,
-                                    row % values,
-                                    sum,
-                                    channels as usize,
-                                    first_channel as usize,
-                                    layout,
-                                    sums,
-                                );
-                            }
-                        }
-                    }
-                }
-                row += units;
-            }
+            sum_group(
+                &mut target,
+                &targets,
+                &batch,
+                &partials,
+                from,
+                count,
+                channels as usize,
+                first_channel as usize,
+                plan,
+                layout,
+                sums,
+            );
             sync_cube();
             from += comptime!(group as u32);
         }

@@ -68,7 +68,7 @@ pub(super) fn sample(shape: Shape, x: f32, y: f32) -> Sample {
     }
 }
 
-/// What stands for a pair that is not to be looked at: less than every threshold.
+/// Alpha of a pair that is not to be looked at: less than every threshold.
 pub(super) const UNSEEN: f32 = -1.0;
 
 /// The one place that decides what becomes of a (pixel, splat) pair; both passes ask it.

@@ -1,19 +1,19 @@
 //! How the gradients of a splat's tiles become the splat's: in order, or as they come.
 //!
-//! In order, each (tile, splat) pair writes to its own slot, and then the slots of every splat are summed: the same bits
+//! In order, each intersection writes to its own slot, and then the slots of every splat are summed: the same bits
 //! every time. As they come, they are added to the splat's gradient by atomic additions, whose order differs from run to
 //! run: no slots, and nothing to be read again.
 //!
-//! Floor per (tile, splat) pair: in order 24 bytes and 4 per channel to memory, and once more from it; as they come 6
+//! Floor per intersection: in order 24 bytes and 4 per channel to memory, and once more from it; as they come 6
 //! additions and 1 per channel in memory.
 
 use cubecl::client::Client;
 use cubecl::features::AtomicUsage;
 use cubecl::ir::Type;
 use cubecl::prelude::*;
+use splat_core::PROJECTED_WIDTH;
 
 use super::backward::SlotLayout;
-use crate::project::PACKED;
 
 /// How gradients of one splat from many tiles are summed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -28,7 +28,7 @@ pub enum Sums {
 }
 
 impl Sums {
-    /// What this device can do without an order.
+    /// The way without an order that this device has.
     pub(super) fn unordered(self, client: &Client) -> Self {
         let float = Type::atomic(f32::elem_type_native());
         let usage = client.properties().atomic_type_usage(float);
@@ -49,7 +49,7 @@ pub(super) enum Target<A: Numeric> {
     Splats(SplatTarget<A>),
 }
 
-/// The slot of every (tile, splat) pair, and the gradients of all slots.
+/// The slot of every intersection, and the gradients of all slots.
 #[derive(CubeType, CubeLaunch)]
 pub(super) struct SlotTarget {
     pub of: Box<[u32]>,
@@ -105,7 +105,7 @@ pub(super) fn add_to_splat<A: Numeric>(
             add(&gradients.opacities[splat], sum, sums);
         } else {
             add(
-                &gradients.packed[splat * PACKED + packed_entry(value)],
+                &gradients.packed[splat * PROJECTED_WIDTH + packed_entry(value)],
                 sum,
                 sums,
             );
@@ -196,7 +196,7 @@ fn spread(
             grad_colors[splat * channels + channel] = sum;
         }
     } else if comptime!(layout.shape) {
-        let at = splat * PACKED + packed_entry(value);
+        let at = splat * PROJECTED_WIDTH + packed_entry(value);
         if comptime!(first_launch) {
             if value == 5 {
                 grad_opacities[splat] = sum;
@@ -205,7 +205,8 @@ fn spread(
             }
             if value < 4 {
                 // The entries without gradient: depth, compensation, extents.
-                grad_packed[splat * PACKED + select(value == 0, 2usize, value + 5)] = 0.0f32;
+                grad_packed[splat * PROJECTED_WIDTH + select(value == 0, 2usize, value + 5)] =
+                    0.0f32;
             }
         } else if value == 5 {
             grad_opacities[splat] += sum;

@@ -6,12 +6,12 @@
 
 use cubecl::client::Client;
 use cubecl::prelude::*;
+use splat_core::PROJECTED_WIDTH;
 
 use super::MAX_CHANNELS;
 use super::pair::SHAPE;
 use crate::intersect::{Footprint, Grid, TILE};
 use crate::planes::plane_size;
-use crate::project::PACKED;
 
 /// Splats of a batch.
 pub(super) const BATCH: usize = 64;
@@ -194,7 +194,7 @@ impl Batch {
         #[comptime] plan: Plan,
         #[comptime] width: usize,
     ) {
-        let from = splat * PACKED;
+        let from = splat * PROJECTED_WIDTH;
         let mean_x = packed[from];
         let mean_y = packed[from + 1];
         let w11 = packed[from + 3];

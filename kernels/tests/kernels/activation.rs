@@ -1,6 +1,7 @@
 //! The exponential and the logistic function against float64.
 
-use splat_kernels::activation::{Activation, activate, activate_vjp};
+use splat_core::Activation;
+use splat_kernels::activation::{activate, activate_vjp};
 
 use crate::device::{client, download, upload};
 

@@ -6,7 +6,7 @@ use splat_kernels::intersect::{Frames, TILE, TileLists, intersect};
 use crate::device::{client, download_u32, rng, upload, wide};
 use crate::reference::raw_alpha;
 
-const ALPHA_MIN: f32 = 1.0 / 255.0;
+const ALPHA_MIN: f32 = splat_core::ALPHA_MIN as f32;
 
 /// A packed row with the covariance R diag(a², b²) Rᵀ + 0.3 I.
 fn row(x: f32, y: f32, depth: f32, a: f64, b: f64, angle: f64) -> [f32; 9] {
@@ -74,7 +74,7 @@ fn lists(frames: &Frames, packed: &[f32], opacities: &[f32]) -> Option<(TileList
     .unwrap();
     let splats = download_u32(&client, &lists.splats);
     let ranges = download_u32(&client, &lists.ranges);
-    assert_eq!(splats.len(), lists.instances);
+    assert_eq!(splats.len(), lists.intersections);
     let tiles = ranges
         .chunks(2)
         .map(|r| splats[r[0] as usize..r[1] as usize].to_vec())
@@ -187,8 +187,11 @@ fn splats_over_many_tiles_are_listed_by_all_units_together() {
             unseen += usize::from(listed && !seen);
         }
     }
-    println!("{} instances, {unseen} without a pixel", found.instances);
-    assert!(found.instances > 10_000 && unseen < found.instances / 50);
+    println!(
+        "{} intersections, {unseen} without a pixel",
+        found.intersections
+    );
+    assert!(found.intersections > 10_000 && unseen < found.intersections / 50);
 }
 
 #[test]
@@ -205,7 +208,10 @@ fn tiles_are_in_order_of_depth_and_then_of_index() {
         return;
     };
     assert_eq!(tiles.len(), frames.tiles());
-    assert_eq!(tiles.iter().map(Vec::len).sum::<usize>(), lists.instances);
+    assert_eq!(
+        tiles.iter().map(Vec::len).sum::<usize>(),
+        lists.intersections
+    );
     for (tile, list) in tiles.iter().enumerate() {
         let camera = tile / (frames.tiles() / 2);
         assert!(
@@ -224,7 +230,7 @@ fn tiles_are_in_order_of_depth_and_then_of_index() {
 }
 
 #[test]
-fn slots_of_a_splat_are_consecutive_and_name_its_instances() {
+fn slots_of_a_splat_are_consecutive_and_name_its_intersections() {
     let frames = Frames {
         cameras: 1,
         gaussians: 300,
@@ -246,13 +252,13 @@ fn slots_of_a_splat_are_consecutive_and_name_its_instances() {
         &slots.offsets,
     ]
     .map(|b| download_u32(&client, b));
-    let mut owner = vec![u32::MAX; lists.instances];
+    let mut owner = vec![u32::MAX; lists.intersections];
     let found = visible[frames.gaussians] as usize;
     assert!(found > 100 && found < frames.gaussians);
     for j in 0..found {
         owner[offsets[j] as usize..offsets[j + 1] as usize].fill(order[j]);
     }
-    assert_eq!(offsets[found] as usize, lists.instances);
+    assert_eq!(offsets[found] as usize, lists.intersections);
     for (splat, pair) in visible.windows(2).enumerate() {
         let listed = order[..found].contains(&(splat as u32));
         assert_eq!(pair[1] - pair[0], u32::from(listed), "splat {splat}");
@@ -283,7 +289,7 @@ fn nothing_to_see_gives_empty_lists() {
     let Some((none, tiles)) = lists(&frames, &[], &[]) else {
         return;
     };
-    assert_eq!(none.instances, 0);
+    assert_eq!(none.intersections, 0);
     assert_eq!(tiles, vec![Vec::<u32>::new(); 6]);
     // All culled, all too faint, and not a number.
     let frames = Frames {
@@ -294,6 +300,6 @@ fn nothing_to_see_gives_empty_lists() {
     packed.extend(row(10.0, 10.0, 1.0, 3.0, 3.0, 0.0));
     packed.extend(row(f32::NAN, 10.0, 1.0, 3.0, 3.0, 0.0));
     let (none, tiles) = lists(&frames, &packed, &[0.9, 0.0039, 0.9]).unwrap();
-    assert_eq!(none.instances, 0);
+    assert_eq!(none.intersections, 0);
     assert_eq!(tiles, vec![Vec::<u32>::new(); 6]);
 }

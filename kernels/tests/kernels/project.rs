@@ -1,23 +1,26 @@
 //! Projection and its gradients.
 
-use splat_kernels::project::{ProjectInputs, ProjectSettings, project, project_backward};
+use splat_core::{ImageSize, ProjectSettings};
+use splat_kernels::project::{ProjectInputs, project, project_backward};
 
 use crate::device::{assert_close, client, differences, download, rng, uniform, upload, wide};
 use crate::reference::{self, View};
 
 const WIDTH: usize = 70;
 const HEIGHT: usize = 50;
+const SIZE: ImageSize = ImageSize {
+    width: WIDTH as u32,
+    height: HEIGHT as u32,
+};
 
 fn settings() -> ProjectSettings {
     let view = View::new(WIDTH, HEIGHT);
     ProjectSettings {
-        width: WIDTH as u32,
-        height: HEIGHT as u32,
-        near: view.near as f32,
-        far: view.far as f32,
-        eps2d: view.eps2d as f32,
-        clamp_margin: view.margin as f32,
-        alpha_min: view.alpha_min as f32,
+        near: view.near,
+        far: view.far,
+        eps2d: view.eps2d,
+        clamp_margin: view.margin,
+        alpha_min: view.alpha_min,
     }
 }
 
@@ -76,7 +79,7 @@ fn projection_and_all_its_gradients_agree_with_float64() {
     let inputs = inputs(&client, &scene);
     let wide_scene = scene.each_ref().map(|v| wide(v));
     let expected = reference_all(&wide_scene);
-    let packed = download(&client, &project(&client, &inputs, &settings()));
+    let packed = download(&client, &project(&client, &inputs, SIZE, &settings()));
     let visible = |rows: &[f64]| rows.chunks(9).filter(|row| row[7] > 0.0).count();
     assert!(
         visible(&expected) > 100 && visible(&expected) < 500,
@@ -97,13 +100,15 @@ fn projection_and_all_its_gradients_agree_with_float64() {
         row[7] = 0.0;
         row[8] = 0.0;
     }
-    let grads = project_backward(
+    let grads: [_; 5] = project_backward(
         &client,
         &inputs,
         &upload(&client, &weights),
+        SIZE,
         &settings(),
-        [true; 5],
-    );
+        [true; 5].into(),
+    )
+    .into();
     let weights = wide(&weights);
     let names = ["means", "quats", "scales", "viewmats", "intrinsics"];
     for (which, grad) in grads.iter().enumerate() {
@@ -127,13 +132,15 @@ fn only_the_wanted_gradients_are_returned() {
     let scene = scene(10);
     let inputs = inputs(&client, &scene);
     let grad = upload(&client, &[1.0; 2 * 10 * 9]);
-    let all = project_backward(&client, &inputs, &grad, &settings(), [true; 5]);
+    let all: [_; 5] =
+        project_backward(&client, &inputs, &grad, SIZE, &settings(), [true; 5].into()).into();
     for wanted in [
         [true, false, false, false, false],
         [false, true, true, false, true],
         [false, false, false, true, false],
     ] {
-        let some = project_backward(&client, &inputs, &grad, &settings(), wanted);
+        let some: [_; 5] =
+            project_backward(&client, &inputs, &grad, SIZE, &settings(), wanted.into()).into();
         for i in 0..5 {
             assert_eq!(some[i].is_some(), wanted[i]);
             if let (Some(some), Some(all)) = (&some[i], &all[i]) {
@@ -176,12 +183,13 @@ fn bad_gaussians_are_culled_and_their_gradients_are_zero() {
         intrinsics[..4].to_vec(),
     ];
     let inputs = inputs(&client, &scene);
-    let packed = download(&client, &project(&client, &inputs, &settings()));
+    let packed = download(&client, &project(&client, &inputs, SIZE, &settings()));
     for (case, row) in cases.iter().zip(packed.chunks(9)) {
         assert_eq!(row, [0.0; 9], "{}", case.0);
     }
     let grad = upload(&client, &vec![1.0; packed.len()]);
-    for grad in project_backward(&client, &inputs, &grad, &settings(), [true; 5]) {
+    let grads = project_backward(&client, &inputs, &grad, SIZE, &settings(), [true; 5].into());
+    for grad in <[_; 5]>::from(grads) {
         assert!(download(&client, &grad.unwrap()).iter().all(|v| *v == 0.0));
     }
 }
@@ -203,20 +211,22 @@ fn the_length_of_a_quaternion_does_not_matter() {
         intrinsics[..4].to_vec(),
     ];
     let inputs = inputs(&client, &scene);
-    let packed = download(&client, &project(&client, &inputs, &settings()));
+    let packed = download(&client, &project(&client, &inputs, SIZE, &settings()));
     assert!(packed[7] > 0.0);
     for row in packed.chunks(9) {
         assert_close("row", row, &wide(&packed[..9]), 1e-6);
     }
     // The gradient is orthogonal to the quaternion.
     let grad = upload(&client, &uniform(&mut rng(8), packed.len(), -1.0, 1.0));
-    let [_, grad, ..] = project_backward(
+    let [_, grad, ..]: [_; 5] = project_backward(
         &client,
         &inputs,
         &grad,
+        SIZE,
         &settings(),
-        [false, true, false, false, false],
-    );
+        [false, true, false, false, false].into(),
+    )
+    .into();
     for (q, g) in wide(&scene[1])
         .chunks(4)
         .zip(wide(&download(&client, &grad.unwrap())).chunks(4))
@@ -247,7 +257,7 @@ fn needles_keep_their_determinant() {
     ];
     let packed = download(
         &client,
-        &project(&client, &inputs(&client, &scene), &settings()),
+        &project(&client, &inputs(&client, &scene), SIZE, &settings()),
     );
     let expected = reference_all(&scene.each_ref().map(|v| wide(v)));
     for k in [3, 4, 5] {
@@ -264,14 +274,16 @@ fn no_gaussians_project_to_nothing() {
     let [_, _, _, viewmats, intrinsics] = scene(1);
     let scene = [vec![], vec![], vec![], viewmats, intrinsics];
     let inputs = inputs(&client, &scene);
-    assert!(project(&client, &inputs, &settings()).is_empty());
-    let grads = project_backward(
+    assert!(project(&client, &inputs, SIZE, &settings()).is_empty());
+    let grads: [_; 5] = project_backward(
         &client,
         &inputs,
         &upload(&client, &[]),
+        SIZE,
         &settings(),
-        [true; 5],
-    );
+        [true; 5].into(),
+    )
+    .into();
     let grads = grads.map(|grad| download(&client, &grad.unwrap()));
     assert!(grads[..3].iter().all(Vec::is_empty));
     assert_eq!(grads[3], [0.0; 32]);

@@ -61,7 +61,7 @@ impl Scene {
                 gaussians,
                 width,
                 height,
-                alpha_min: 1.0 / 255.0,
+                alpha_min: splat_core::ALPHA_MIN as f32,
             },
             channels,
             packed,
@@ -137,15 +137,16 @@ fn check(name: &str, scene: &Scene, limit: f64) {
             &image,
             1e-6,
         );
-        let grads = rasterize_vjp(
+        let grads: [_; 4] = rasterize_vjp(
             &client,
             &inputs,
             &state,
             &grad_output,
             &scene.frames,
             &settings,
-            [true; 4],
-        );
+            [true; 4].into(),
+        )
+        .into();
         for (which, part) in ["packed", "colors", "opacities", "background"]
             .iter()
             .enumerate()
@@ -217,15 +218,16 @@ fn the_cap_of_alpha_stops_the_gradient_through_it() {
     let inputs = scene.inputs(&client);
     let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
     let grad = upload(&client, &[1.0, 1.0]);
-    let [packed, colors, opacities, background] = rasterize_vjp(
+    let [packed, colors, opacities, background]: [_; 4] = rasterize_vjp(
         &client,
         &inputs,
         &state,
         &grad,
         &scene.frames,
         &SETTINGS,
-        [true; 4],
-    );
+        [true; 4].into(),
+    )
+    .into();
     assert_close("alpha", &download(&client, &output)[1..], &[0.99], 1e-6);
     assert_eq!(download(&client, &packed.unwrap()), [0.0; 9]);
     assert_eq!(download(&client, &opacities.unwrap()), [0.0]);
@@ -260,15 +262,16 @@ fn many_faint_layers_keep_their_transmittance() {
         1e-5,
     );
     let weights = uniform(&mut rng(38), output.len(), 0.0, 1.0);
-    let [_, colors, ..] = rasterize_vjp(
+    let [_, colors, ..]: [_; 4] = rasterize_vjp(
         &client,
         &inputs,
         &state,
         &upload(&client, &weights),
         &scene.frames,
         &SETTINGS,
-        [false, true, false, false],
-    );
+        [false, true, false, false].into(),
+    )
+    .into();
     // dL/dcolour_i = Σ over pixels of T_i alpha_i g: the image is linear in the colours.
     let (packed, opacities) = (&wide_scene[0], &wide_scene[2]);
     let mut expected = vec![0.0; 2000];
@@ -307,15 +310,16 @@ fn nothing_to_see_gives_the_background() {
         scene.reference(&scene.wide())
     );
     let grad = upload(&client, &vec![1.0; output.len()]);
-    let grads = rasterize_vjp(
+    let grads: [_; 4] = rasterize_vjp(
         &client,
         &inputs,
         &state,
         &grad,
         &scene.frames,
         &SETTINGS,
-        [true; 4],
-    );
+        [true; 4].into(),
+    )
+    .into();
     let [packed, colors, opacities, background] = grads.map(|g| download(&client, &g.unwrap()));
     assert!(packed.is_empty() && colors.is_empty() && opacities.is_empty());
     assert_eq!(background, [95.0; 4]);
@@ -327,19 +331,20 @@ fn only_the_wanted_gradients_and_the_same_bits_every_time() {
     let scene = Scene::new(1, 60, 40, 40, 3, [0.1, 0.9], 40);
     let inputs = scene.inputs(&client);
     let weights = uniform(&mut rng(41), 40 * 40 * 4, -1.0, 1.0);
-    let run = |sums, wanted| {
+    let run = |sums, needs_grad: [bool; 4]| {
         let settings = RasterizeSettings { sums, ..SETTINGS };
         let (output, state) = rasterize(&client, &inputs, &scene.frames, &settings).unwrap();
         let grad = upload(&client, &weights);
-        let grads = rasterize_vjp(
+        let grads: [_; 4] = rasterize_vjp(
             &client,
             &inputs,
             &state,
             &grad,
             &scene.frames,
             &settings,
-            wanted,
-        );
+            needs_grad.into(),
+        )
+        .into();
         (
             download(&client, &output),
             grads.map(|g| g.map(|g| download(&client, &g))),
@@ -394,17 +399,18 @@ fn sums_of_thousands_of_tiles_lose_nothing() {
     let [ordered, atomic, exchange] = ALL_SUMS.map(|sums| {
         let settings = RasterizeSettings { sums, ..SETTINGS };
         let (_, state) = rasterize(&client, &inputs, &scene.frames, &settings).unwrap();
-        assert_eq!(state.lists.instances, 3 * 64 * 64);
+        assert_eq!(state.lists.intersections, 3 * 64 * 64);
         assert_eq!(state.lists.slots.is_some(), sums == Sums::Ordered);
-        let [packed, colors, ..] = rasterize_vjp(
+        let [packed, colors, ..]: [_; 4] = rasterize_vjp(
             &client,
             &inputs,
             &state,
             &grad,
             &scene.frames,
             &settings,
-            [true; 4],
-        );
+            [true; 4].into(),
+        )
+        .into();
         [packed, colors].map(|grad| download(&client, &grad.unwrap()))
     });
     let [packed, colors] = ordered;
@@ -437,15 +443,16 @@ fn more_tiles_than_one_dimension_of_workgroups_can_hold() {
     let expected = scene.reference(&scene.wide());
     assert_close("image", &download(&client, &output), &expected, 1e-6);
     let grad = upload(&client, &vec![1.0; output.len()]);
-    let [_, colors, ..] = rasterize_vjp(
+    let [_, colors, ..]: [_; 4] = rasterize_vjp(
         &client,
         &inputs,
         &state,
         &grad,
         &scene.frames,
         &SETTINGS,
-        [false, true, false, false],
-    );
+        [false, true, false, false].into(),
+    )
+    .into();
     // One colour of 1 shines on all pixels: the sum of its weights.
     let expected: Vec<f64> = (0..3)
         .map(|n| {
@@ -486,7 +493,7 @@ fn evaluations_are_counted() {
         for &i in &order {
             until_stop += 1;
             let raw = reference::raw_alpha(&packed[i * 9..i * 9 + 9], opacities[i], x, y);
-            if raw < 1.0 / 255.0 {
+            if raw < splat_core::ALPHA_MIN {
                 continue;
             }
             let next = t * (1.0 - raw.min(0.99));
@@ -546,18 +553,19 @@ fn time_of_the_stages_at_270_by_480() {
         let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
         download(&client, &output);
         lap("intersect + forward");
-        let grads = rasterize_vjp(
+        let grads: [_; 4] = rasterize_vjp(
             &client,
             &inputs,
             &state,
             &grad,
             &scene.frames,
             &SETTINGS,
-            [true; 4],
-        );
+            [true; 4].into(),
+        )
+        .into();
         download(&client, grads[2].as_ref().unwrap());
         lap("backward");
-        println!("{} instances", lists.instances);
+        println!("{} intersections", lists.intersections);
         if round == 3 {
             let count =
                 count_evaluations(&client, &inputs, &state, &scene.frames, &SETTINGS).unwrap();

@@ -20,7 +20,7 @@ impl View {
             far: 1e10,
             eps2d: 0.3,
             margin: 0.15,
-            alpha_min: 1.0 / 255.0,
+            alpha_min: splat_core::ALPHA_MIN,
         }
     }
 }
@@ -98,10 +98,10 @@ pub fn project(
         reach * a.sqrt(),
         reach * (dot(v2, v2) + e).sqrt(),
     ];
-    let on_screen = row[0] + row[7] >= 0.0
-        && row[0] - row[7] <= sx
-        && row[1] + row[8] >= 0.0
-        && row[1] - row[8] <= sy;
+    let on_screen = row[0] + row[7] > 0.0
+        && row[0] - row[7] < sx
+        && row[1] + row[8] > 0.0
+        && row[1] - row[8] < sy;
     if on_screen && row.iter().all(|v| v.is_finite()) {
         row
     } else {

@@ -1,7 +1,8 @@
 //! Colours of coefficients in half precision: those of the same coefficients in single precision, bit for bit.
 
 use cubecl::client::Client;
-use splat_kernels::sh_colors::{ShInputs, ShRest, sh_colors, sh_colors_backward};
+use splat_core::ShColorTensors;
+use splat_kernels::sh_colors::{ShColorInputs, ShRest, sh_colors, sh_colors_backward};
 use splat_kernels::{Buffer, HalfBuffer, reads_half};
 
 use crate::device::{client, rng, uniform, upload};
@@ -23,14 +24,19 @@ fn single(half: u16) -> f32 {
 }
 
 /// Colours, and the gradients of sh0, means and centres, as bits.
-fn bits(client: &Client, inputs: &ShInputs, grad: &Buffer, degree: usize) -> Vec<Vec<u32>> {
+fn bits(client: &Client, inputs: &ShColorInputs, grad: &Buffer, degree: usize) -> Vec<Vec<u32>> {
     let read = |buffer: &Buffer| -> Vec<u32> {
         let values = buffer.read_f32(client).unwrap();
         values.iter().map(|value| value.to_bits()).collect()
     };
-    let wanted = [true, false, true, true];
-    let grads = sh_colors_backward(client, inputs, grad, degree, false, wanted);
-    let mut found = vec![read(&sh_colors(client, inputs, degree))];
+    let wanted = ShColorTensors {
+        sh0: true,
+        means: true,
+        centers: true,
+        ..Default::default()
+    };
+    let grads: [_; 5] = sh_colors_backward(client, inputs, grad, degree.into(), wanted).into();
+    let mut found = vec![read(&sh_colors(client, inputs, degree.into()))];
     found.extend(grads.iter().flatten().map(read));
     assert_eq!(found.len(), 4);
     found
@@ -75,7 +81,7 @@ fn halves_are_read_as_the_numbers_they_stand_for() {
     let bytes: Vec<u8> = halves.iter().flat_map(|half| half.to_le_bytes()).collect();
     let handle = client.create_from_slice(&bytes);
     assert!(HalfBuffer::new(handle.clone(), halves.len() + 1).is_err());
-    let exact = ShInputs {
+    let exact = ShColorInputs {
         sh0: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
         sh_rest: Some(ShRest::Exact(upload(&client, &values))),
         stored: 15,
@@ -83,7 +89,7 @@ fn halves_are_read_as_the_numbers_they_stand_for() {
         centers: upload(&client, &uniform(&mut rng, cameras * 3, -1.0, 1.0)),
         seen: None,
     };
-    let half = ShInputs {
+    let half = ShColorInputs {
         sh_rest: Some(ShRest::Half(HalfBuffer::new(handle, halves.len()).unwrap())),
         ..exact.clone()
     };

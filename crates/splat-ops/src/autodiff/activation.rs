@@ -1,45 +1,48 @@
 //! `exp` and `sigmoid`: save input and output; each gradient takes what is exact for it.
 
-use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
-use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
-use super::register;
-use crate::activation::Activation;
-use crate::backend::SplatBackend;
+use tracing::trace_span;
 
-#[derive(Debug)]
-struct ActivationBackward;
+use super::{Saved, record};
+use crate::backend::{ActivationBackend, ActivationOps};
+use crate::settings::Activation;
 
-impl<B: SplatBackend> Backward<B, 1> for ActivationBackward {
-    type State = ([FloatTensor<B>; 2], Activation);
+#[derive(Debug, Clone)]
+struct Activated<B: ActivationBackend> {
+    x: FloatTensor<B>,
+    y: FloatTensor<B>,
+    function: Activation,
+}
 
-    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let grad = grads.consume::<B>(&ops.node);
-        let ([x, y], function) = ops.state;
-        let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
-        let value = parents[0]
-            .is_some()
-            .then(|| B::activate_backward(x, y, grad, function));
-        register::<B, 1>(grads, parents, [value]);
+impl<B: ActivationBackend> Saved<B, 1> for Activated<B> {
+    fn gradients(self, grad: FloatTensor<B>, _: [bool; 1]) -> [Option<FloatTensor<B>>; 1] {
+        let _span = trace_span!("activations gradient").entered();
+        [Some(B::activation_backward(
+            self.x,
+            self.y,
+            grad,
+            self.function,
+        ))]
     }
 }
 
-pub(super) fn activation<B: SplatBackend, C: CheckpointStrategy>(
-    x: FloatTensor<Autodiff<B, C>>,
-    function: Activation,
-) -> FloatTensor<Autodiff<B, C>> {
-    let prep = ActivationBackward
-        .prepare::<C>([x.node()])
-        .compute_bound()
-        .stateful();
-    let x = x.into_primitive();
-    match prep {
-        OpsKind::Tracked(prep) => {
-            let y = B::activate(x.clone(), function);
-            prep.finish(([x, y.clone()], function), y)
-        }
-        OpsKind::UnTracked(prep) => prep.finish(B::activate(x, function)),
+impl<B: ActivationBackend, C: CheckpointStrategy> ActivationOps for Autodiff<B, C> {
+    fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self> {
+        record::<B, C, Activated<B>, _, 1>(
+            [x.node()],
+            x.into_primitive(),
+            |x| {
+                let y = B::activation(x.clone(), function);
+                let saved = Activated {
+                    x,
+                    y: y.clone(),
+                    function,
+                };
+                (y, saved)
+            },
+            |x| B::activation(x, function),
+        )
     }
 }

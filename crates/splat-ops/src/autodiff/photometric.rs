@@ -1,69 +1,64 @@
 //! `photometric`: saves both images and what the backend has made in passing for the gradient.
 
-use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
-use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
-use super::register;
-use crate::backend::{SplatBackend, Target};
-use crate::ssim::SsimArgs;
+use tracing::trace_span;
 
-#[derive(Debug)]
-struct PhotometricBackward;
+use super::{Saved, record};
+use crate::backend::{PhotometricBackend, PhotometricOps, Target};
+use crate::settings::SsimArgs;
 
 #[derive(Debug, Clone)]
-struct State<B: SplatBackend> {
+struct Photometric<B: PhotometricBackend> {
     rendered: FloatTensor<B>,
     target: Target<B>,
     kept: FloatTensor<B>,
     args: SsimArgs,
 }
 
-impl<B: SplatBackend> Backward<B, 1> for PhotometricBackward {
-    type State = State<B>;
-
-    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let grad = grads.consume::<B>(&ops.node);
-        let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
-        let State {
+impl<B: PhotometricBackend> Saved<B, 1> for Photometric<B> {
+    fn gradients(self, grad: FloatTensor<B>, _: [bool; 1]) -> [Option<FloatTensor<B>>; 1] {
+        let _span = trace_span!("photometric gradient").entered();
+        let Self {
             rendered,
             target,
             kept,
             args,
-        } = ops.state;
-        let value = parents[0]
-            .is_some()
-            .then(|| B::photometric_backward(rendered, target, kept, grad, &args));
-        register::<B, 1>(grads, parents, [value]);
+        } = self;
+        [Some(B::photometric_backward(
+            rendered, target, kept, grad, &args,
+        ))]
     }
 }
 
-pub(super) fn photometric<B: SplatBackend, C: CheckpointStrategy>(
-    rendered: FloatTensor<Autodiff<B, C>>,
-    target: Target<Autodiff<B, C>>,
-    args: SsimArgs,
-) -> FloatTensor<Autodiff<B, C>> {
-    let prep = PhotometricBackward
-        .prepare::<C>([rendered.node()])
-        .compute_bound()
-        .stateful();
-    let rendered = rendered.into_primitive();
-    let target = match target {
-        Target::Levels(levels) => Target::Levels(levels),
-        Target::Values(values) => Target::Values(values.into_primitive()),
-    };
-    match prep {
-        OpsKind::Tracked(prep) => {
-            let (means, kept) = B::photometric_tracked(rendered.clone(), target.clone(), &args);
-            let state = State {
-                rendered,
-                target,
-                kept,
-                args,
-            };
-            prep.finish(state, means)
-        }
-        OpsKind::UnTracked(prep) => prep.finish(B::photometric(rendered, target, &args)),
+impl<B: PhotometricBackend, C: CheckpointStrategy> PhotometricOps for Autodiff<B, C> {
+    fn photometric(
+        rendered: FloatTensor<Self>,
+        target: Target<Self>,
+        args: SsimArgs,
+    ) -> FloatTensor<Self> {
+        let target = match target {
+            Target::Levels(levels) => Target::Levels(levels),
+            Target::Values(values) => Target::Values(values.into_primitive()),
+        };
+        record::<B, C, Photometric<B>, _, 1>(
+            [rendered.node()],
+            (rendered.into_primitive(), target, args),
+            |(rendered, target, args)| {
+                let (losses, kept) =
+                    B::photometric_tracked(rendered.clone(), target.clone(), &args);
+                (
+                    losses,
+                    Photometric {
+                        rendered,
+                        target,
+                        kept,
+                        args,
+                    },
+                )
+            },
+            |(rendered, target, args)| B::photometric(rendered, target, args),
+        )
     }
 }

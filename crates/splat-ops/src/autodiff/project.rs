@@ -1,49 +1,34 @@
 //! `project`: saves its five inputs; the backward recomputes what lies between.
 
-use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
-use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
-use super::register;
-use crate::backend::SplatBackend;
+use tracing::trace_span;
+
+use super::{Saved, record};
+use crate::backend::{OpInputs, ProjectBackend, ProjectInputs, ProjectOps};
 use crate::settings::ProjectArgs;
 
-#[derive(Debug)]
-struct ProjectBackward;
+#[derive(Debug, Clone)]
+struct Project<B: ProjectBackend> {
+    inputs: ProjectInputs<B>,
+    args: ProjectArgs,
+}
 
-impl<B: SplatBackend> Backward<B, 5> for ProjectBackward {
-    type State = ([FloatTensor<B>; 5], ProjectArgs);
-
-    fn backward(self, ops: Ops<Self::State, 5>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let grad = grads.consume::<B>(&ops.node);
-        let ([means, quats, scales, viewmats, intrinsics], args) = ops.state;
-        let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
-        let wanted = parents.map(|parent| parent.is_some());
-        let values = B::project_backward(
-            means, quats, scales, viewmats, intrinsics, grad, &args, wanted,
-        );
-        register::<B, 5>(grads, parents, values);
+impl<B: ProjectBackend> Saved<B, 5> for Project<B> {
+    fn gradients(self, grad: FloatTensor<B>, needs_grad: [bool; 5]) -> [Option<FloatTensor<B>>; 5] {
+        let _span = trace_span!("project gradient").entered();
+        B::project_backward(self.inputs, grad, &self.args, needs_grad.into()).into()
     }
 }
 
-pub(super) fn project<B: SplatBackend, C: CheckpointStrategy>(
-    inputs: [FloatTensor<Autodiff<B, C>>; 5],
-    args: ProjectArgs,
-) -> FloatTensor<Autodiff<B, C>> {
-    let prep = ProjectBackward
-        .prepare::<C>(inputs.each_ref().map(|input| input.node()))
-        .compute_bound()
-        .stateful();
-    let inputs = inputs.map(|input| input.into_primitive());
-    let forward = |[means, quats, scales, viewmats, intrinsics]: [FloatTensor<B>; 5]| {
-        B::project_forward(means, quats, scales, viewmats, intrinsics, &args)
-    };
-    match prep {
-        OpsKind::Tracked(prep) => {
-            let output = forward(inputs.clone());
-            prep.finish((inputs, args), output)
-        }
-        OpsKind::UnTracked(prep) => prep.finish(forward(inputs)),
+impl<B: ProjectBackend, C: CheckpointStrategy> ProjectOps for Autodiff<B, C> {
+    fn project(OpInputs(inputs): ProjectInputs<Self>, args: ProjectArgs) -> FloatTensor<Self> {
+        record::<B, C, Project<B>, _, 5>(
+            <[_; 5]>::from(inputs.clone()).map(|input| input.node()),
+            OpInputs(inputs.map(|input| input.into_primitive())),
+            |inputs| (B::project(inputs.clone(), args), Project { inputs, args }),
+            |inputs| B::project(inputs, args),
+        )
     }
 }

@@ -1,37 +1,27 @@
 //! `screen_probe`: splats pass unchanged, and so does their gradient, which the probe gets too.
 
-use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
-use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
-use super::register;
-use crate::backend::SplatBackend;
+use super::{Saved, record};
+use crate::backend::ScreenProbeOps;
 
-#[derive(Debug)]
-struct ScreenProbeBackward;
+#[derive(Debug, Clone)]
+struct ScreenProbe;
 
-impl<B: SplatBackend> Backward<B, 2> for ScreenProbeBackward {
-    type State = ();
-
-    fn backward(self, ops: Ops<Self::State, 2>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let grad = grads.consume::<B>(&ops.node);
-        let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
-        register::<B, 2>(grads, parents, [Some(grad.clone()), Some(grad)]);
+impl<B: ScreenProbeOps> Saved<B, 2> for ScreenProbe {
+    fn gradients(self, grad: FloatTensor<B>, _: [bool; 2]) -> [Option<FloatTensor<B>>; 2] {
+        [Some(grad.clone()), Some(grad)]
     }
 }
 
-pub(super) fn screen_probe<B: SplatBackend, C: CheckpointStrategy>(
-    packed: FloatTensor<Autodiff<B, C>>,
-    probe: FloatTensor<Autodiff<B, C>>,
-) -> FloatTensor<Autodiff<B, C>> {
-    let prep = ScreenProbeBackward
-        .prepare::<C>([packed.node(), probe.node()])
-        .compute_bound()
-        .stateful();
-    let packed = packed.into_primitive();
-    match prep {
-        OpsKind::Tracked(prep) => prep.finish((), packed),
-        OpsKind::UnTracked(prep) => prep.finish(packed),
+impl<B: ScreenProbeOps, C: CheckpointStrategy> ScreenProbeOps for Autodiff<B, C> {
+    fn screen_probe(packed: FloatTensor<Self>, probe: FloatTensor<Self>) -> FloatTensor<Self> {
+        record::<B, C, ScreenProbe, _, 2>(
+            [packed.node(), probe.node()],
+            packed.into_primitive(),
+            |packed| (packed, ScreenProbe),
+            |packed| packed,
+        )
     }
 }

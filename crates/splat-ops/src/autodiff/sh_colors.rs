@@ -1,86 +1,88 @@
 //! `sh_colors`: saves its inputs. At degree 0 the coefficients of that degree are the only parent; what was seen never is
 //! one.
 
-use burn::backend::autodiff::checkpoint::{base::Checkpointer, strategy::CheckpointStrategy};
-use burn::backend::autodiff::grads::Gradients;
-use burn::backend::autodiff::ops::{Backward, Ops, OpsKind};
+use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};
 
-use super::register;
+use tracing::trace_span;
+
+use super::{Saved, record};
 use crate::ShColorSettings;
-use crate::backend::{ShInputs, SplatBackend};
+use crate::backend::{
+    OpInputs, ShColorGradients, ShColorInputs, ShColorTensors, ShColorsBackend, ShColorsOps,
+};
 
-#[derive(Debug)]
-struct ShColorsBackward;
-
-impl<B: SplatBackend> Backward<B, 1> for ShColorsBackward {
-    type State = (ShInputs<B>, ShColorSettings);
-
-    fn backward(self, ops: Ops<Self::State, 1>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let grad = grads.consume::<B>(&ops.node);
-        let (inputs, settings) = ops.state;
-        let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
-        let wanted = [parents[0].is_some(), false, false, false];
-        let [sh0, ..] = B::sh_colors_backward(inputs, grad, settings, wanted);
-        register::<B, 1>(grads, parents, [sh0]);
-    }
-}
-
-impl<B: SplatBackend> Backward<B, 4> for ShColorsBackward {
-    type State = (ShInputs<B>, ShColorSettings);
-
-    fn backward(self, ops: Ops<Self::State, 4>, grads: &mut Gradients, _: &mut Checkpointer) {
-        let grad = grads.consume::<B>(&ops.node);
-        let (inputs, settings) = ops.state;
-        let parents = ops.parents.map(|parent| parent.map(|parent| parent.id));
-        let wanted = parents.map(|parent| parent.is_some());
-        let values = B::sh_colors_backward(inputs, grad, settings, wanted);
-        register::<B, 4>(grads, parents, values);
-    }
-}
-
-pub(super) fn sh_colors<B: SplatBackend, C: CheckpointStrategy>(
-    sh0: FloatTensor<Autodiff<B, C>>,
-    sh_rest: Option<FloatTensor<Autodiff<B, C>>>,
-    means: FloatTensor<Autodiff<B, C>>,
-    centers: FloatTensor<Autodiff<B, C>>,
-    seen: Option<FloatTensor<Autodiff<B, C>>>,
+#[derive(Debug, Clone)]
+struct ShColors<B: ShColorsBackend> {
+    inputs: ShColorInputs<B>,
     settings: ShColorSettings,
-) -> FloatTensor<Autodiff<B, C>> {
-    let inputs = |sh_rest| ShInputs {
-        sh0: sh0.clone().into_primitive(),
-        sh_rest,
-        means: means.clone().into_primitive(),
-        centers: centers.clone().into_primitive(),
-        seen: seen.map(|seen| seen.into_primitive()),
-    };
-    match sh_rest {
-        Some(rest) => {
-            let nodes = [&sh0, &rest, &means, &centers].map(|input| input.node());
-            let prep = ShColorsBackward.prepare::<C>(nodes);
-            let inputs = inputs(Some(rest.into_primitive()));
-            record::<B, C, 4>(prep.compute_bound().stateful(), inputs, settings)
-        }
-        None => {
-            let prep = ShColorsBackward.prepare::<C>([sh0.node()]);
-            record::<B, C, 1>(prep.compute_bound().stateful(), inputs(None), settings)
-        }
+}
+
+impl<B: ShColorsBackend> ShColors<B> {
+    fn new(inputs: ShColorInputs<B>, settings: ShColorSettings) -> (FloatTensor<B>, Self) {
+        let colors = B::sh_colors(inputs.clone(), settings);
+        (colors, Self { inputs, settings })
+    }
+
+    fn backward(
+        self,
+        grad: FloatTensor<B>,
+        needs_grad: ShColorTensors<bool>,
+    ) -> ShColorGradients<B> {
+        let _span = trace_span!("colours gradient").entered();
+        B::sh_colors_backward(self.inputs, grad, self.settings, needs_grad)
     }
 }
 
-fn record<B: SplatBackend, C: CheckpointStrategy, const N: usize>(
-    prep: OpsKind<ShColorsBackward, B, (ShInputs<B>, ShColorSettings), C, N>,
-    inputs: ShInputs<B>,
-    settings: ShColorSettings,
-) -> FloatTensor<Autodiff<B, C>>
-where
-    ShColorsBackward: Backward<B, N, State = (ShInputs<B>, ShColorSettings)>,
-{
-    match prep {
-        OpsKind::Tracked(prep) => {
-            let colors = B::sh_colors_forward(inputs.clone(), settings);
-            prep.finish((inputs, settings), colors)
+impl<B: ShColorsBackend> Saved<B, 1> for ShColors<B> {
+    fn gradients(self, grad: FloatTensor<B>, [sh0]: [bool; 1]) -> [Option<FloatTensor<B>>; 1] {
+        let needs_grad = ShColorTensors {
+            sh0,
+            ..Default::default()
+        };
+        [self.backward(grad, needs_grad).sh0]
+    }
+}
+
+impl<B: ShColorsBackend> Saved<B, 4> for ShColors<B> {
+    fn gradients(
+        self,
+        grad: FloatTensor<B>,
+        [sh0, sh_rest, means, centers]: [bool; 4],
+    ) -> [Option<FloatTensor<B>>; 4] {
+        let needs_grad = ShColorTensors {
+            sh0,
+            sh_rest,
+            means,
+            centers,
+            seen: false,
+        };
+        let grads = self.backward(grad, needs_grad);
+        [grads.sh0, grads.sh_rest, grads.means, grads.centers]
+    }
+}
+
+impl<B: ShColorsBackend, C: CheckpointStrategy> ShColorsOps for Autodiff<B, C> {
+    fn sh_colors(
+        OpInputs(inputs): ShColorInputs<Self>,
+        settings: ShColorSettings,
+    ) -> FloatTensor<Self> {
+        let sh0 = inputs.sh0.node();
+        let others = inputs
+            .sh_rest
+            .as_ref()
+            .map(|rest| [rest, &inputs.means, &inputs.centers].map(|input| input.node()));
+        let inputs = OpInputs(inputs.map_inputs(|input| input.into_primitive()));
+        let tracked = |inputs| ShColors::new(inputs, settings);
+        let plain = |inputs| B::sh_colors(inputs, settings);
+        match others {
+            Some([rest, means, centers]) => record::<B, C, ShColors<B>, _, 4>(
+                [sh0, rest, means, centers],
+                inputs,
+                tracked,
+                plain,
+            ),
+            None => record::<B, C, ShColors<B>, _, 1>([sh0], inputs, tracked, plain),
         }
-        OpsKind::UnTracked(prep) => prep.finish(B::sh_colors_forward(inputs, settings)),
     }
 }

@@ -1,8 +1,8 @@
 //! Ops composed of Burn's tensor ops, for backends that have nothing of their own, and for what their own do not cover:
 //! other types than f32, windows too long for a workgroup's memory.
 
-mod gaussians;
+mod activation;
 mod photometric;
 
-pub(crate) use gaussians::*;
+pub(crate) use activation::*;
 pub(crate) use photometric::*;

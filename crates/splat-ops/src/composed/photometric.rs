@@ -6,8 +6,9 @@ use burn::backend::tensor::FloatTensor;
 use burn::backend::{Backend, TensorMetadata};
 use burn::tensor::{Shape, Slice};
 
-use crate::backend::{SplatBackend, Target};
-use crate::ssim::{SsimArgs, counted};
+use crate::backend::{BlurOps, OpInputs, SsimBackend, SsimGradients, SsimTensors, Target};
+use crate::settings::SsimArgs;
+use crate::ssim::counted;
 
 /// A, B, C, D of the structural similarity `A C / (B D)`, from the four windowed means.
 fn ssim_terms<B: Backend>(moments: &[FloatTensor<B>], args: &SsimArgs) -> [FloatTensor<B>; 4] {
@@ -27,17 +28,16 @@ fn ssim_terms<B: Backend>(moments: &[FloatTensor<B>], args: &SsimArgs) -> [Float
 }
 
 /// [`ssim_map`](crate::ssim_map), and the windowed means of x, y, x^2 + y^2 and xy.
-pub(crate) fn ssim_forward<B: SplatBackend>(
-    images: [FloatTensor<B>; 2],
+pub(crate) fn ssim_forward<B: BlurOps>(
+    SsimTensors { x, y }: SsimTensors<FloatTensor<B>>,
     args: &SsimArgs,
 ) -> (FloatTensor<B>, Vec<FloatTensor<B>>) {
-    let [x, y] = images;
     let square = |v: &FloatTensor<B>| B::float_mul(v.clone(), v.clone());
     let squares = B::float_add(square(&x), square(&y));
     let product = B::float_mul(x.clone(), y.clone());
     let moments: Vec<_> = [x, y, squares, product]
         .into_iter()
-        .map(|image| B::gaussian_blur(image, &args.window))
+        .map(|image| B::gaussian_blur(image, args.window.clone()))
         .collect();
     let [a, b, c, d] = ssim_terms::<B>(&moments, args);
     (
@@ -47,19 +47,18 @@ pub(crate) fn ssim_forward<B: SplatBackend>(
 }
 
 /// The gradients of [`ssim_forward`]; see the formulas in `cpu/photometric/sweep.rs`.
-pub(crate) fn ssim_backward<B: SplatBackend>(
-    images: [FloatTensor<B>; 2],
-    moments: Vec<FloatTensor<B>>,
+pub(crate) fn ssim_backward<B: BlurOps>(
+    SsimTensors { x, y }: SsimTensors<FloatTensor<B>>,
+    moments: &[FloatTensor<B>],
     grad: FloatTensor<B>,
     args: &SsimArgs,
-    wanted: [bool; 2],
-) -> [Option<FloatTensor<B>>; 2] {
-    let [x, y] = images;
-    let [a, b, c, d] = ssim_terms::<B>(&moments, args);
+    needs_grad: SsimTensors<bool>,
+) -> SsimGradients<B> {
+    let [a, b, c, d] = ssim_terms::<B>(moments, args);
     let mul = |l: &FloatTensor<B>, r: &FloatTensor<B>| B::float_mul(l.clone(), r.clone());
     let div = |l: &FloatTensor<B>, r: &FloatTensor<B>| B::float_div(l.clone(), r.clone());
     let twice = |v: FloatTensor<B>| B::float_mul_scalar(v, 2.0.into());
-    let blur = |v: FloatTensor<B>| B::gaussian_blur(v, &args.window);
+    let blur = |v: FloatTensor<B>| B::gaussian_blur(v, args.window.clone());
 
     let scaled = div(&grad, &mul(&b, &d));
     let weighted = mul(&scaled, &mul(&a, &c));
@@ -76,14 +75,14 @@ pub(crate) fn ssim_backward<B: SplatBackend>(
         let rest = B::float_add(mul(own, &by_squares), mul(other, &by_product));
         B::float_add(by_mean, rest)
     };
-    [
-        wanted[0].then(|| gradient(&x, &y, 0)),
-        wanted[1].then(|| gradient(&y, &x, 1)),
-    ]
+    SsimTensors {
+        x: needs_grad.x.then(|| gradient(&x, &y, 0)),
+        y: needs_grad.y.then(|| gradient(&y, &x, 1)),
+    }
 }
 
 /// The target as values, and as many channels of what was rendered.
-fn images<B: SplatBackend>(rendered: FloatTensor<B>, target: Target<B>) -> [FloatTensor<B>; 2] {
+fn images<B: Backend>(rendered: FloatTensor<B>, target: Target<B>) -> SsimTensors<FloatTensor<B>> {
     let target = match target {
         Target::Values(values) => values,
         Target::Levels(levels) => {
@@ -95,19 +94,22 @@ fn images<B: SplatBackend>(rendered: FloatTensor<B>, target: Target<B>) -> [Floa
         .shape()
         .dims::<4>()
         .map(|length| Slice::from(0..length));
-    [B::float_slice(rendered, &slices), target]
+    SsimTensors {
+        x: B::float_slice(rendered, &slices),
+        y: target,
+    }
 }
 
 /// Where in `[B, H, W, D]` the values lie that count for the mean similarity.
-fn counted_part<B: SplatBackend>(map: &FloatTensor<B>, args: &SsimArgs) -> [Range<usize>; 4] {
+fn counted_part<B: Backend>(map: &FloatTensor<B>, args: &SsimArgs) -> [Range<usize>; 4] {
     let [b, h, w, d] = map.shape().dims();
     let [rows, columns] = counted([h, w], args.window.len());
     [0..b, rows, columns, 0..d]
 }
 
 /// The mean absolute difference, and one less the mean of the counted part of the similarity.
-fn means<B: SplatBackend>(
-    [x, y]: [FloatTensor<B>; 2],
+fn losses<B: Backend>(
+    SsimTensors { x, y }: SsimTensors<FloatTensor<B>>,
     map: FloatTensor<B>,
     args: &SsimArgs,
 ) -> FloatTensor<B> {
@@ -119,24 +121,24 @@ fn means<B: SplatBackend>(
 }
 
 /// [`photometric`](crate::photometric).
-pub(crate) fn photometric<B: SplatBackend>(
+pub(crate) fn photometric<B: SsimBackend>(
     rendered: FloatTensor<B>,
     target: Target<B>,
     args: &SsimArgs,
 ) -> FloatTensor<B> {
     let images = images::<B>(rendered, target);
-    let (map, _) = B::ssim_forward(images.clone(), args);
-    means::<B>(images, map, args)
+    let (map, _) = B::ssim_tracked(OpInputs(images.clone()), args);
+    losses::<B>(images, map, args)
 }
 
 /// The same, and the gradient of the mean similarity.
-pub(crate) fn photometric_tracked<B: SplatBackend>(
+pub(crate) fn photometric_tracked<B: SsimBackend>(
     rendered: FloatTensor<B>,
     target: Target<B>,
     args: &SsimArgs,
 ) -> (FloatTensor<B>, FloatTensor<B>) {
     let images = images::<B>(rendered, target);
-    let (map, moments) = B::ssim_forward(images.clone(), args);
+    let (map, moments) = B::ssim_tracked(OpInputs(images.clone()), args);
     let (device, dtype) = (map.device(), map.dtype().into());
     let part = counted_part::<B>(&map, args);
     let shape = Shape::from(part.each_ref().map(|range| range.len()));
@@ -146,26 +148,26 @@ pub(crate) fn photometric_tracked<B: SplatBackend>(
         &part.map(Slice::from),
         B::float_full(shape, weight, &device, dtype),
     );
-    let slope = match B::ssim_backward(images.clone(), moments, weights, args, [true, false]) {
-        [Some(slope), _] => slope,
-        // A backend that has not computed what it was asked for has nothing to add.
-        [None, _] => B::float_zeros(map.shape(), &device, dtype),
-    };
-    (means::<B>(images, map, args), slope)
+    let inputs = OpInputs(images.clone());
+    let needs_grad = SsimTensors { x: true, y: false };
+    let slope = B::ssim_backward(inputs, moments, weights, args, needs_grad).x;
+    // A backend that has not computed what it was asked for has nothing to add.
+    let kept = slope.unwrap_or_else(|| B::float_zeros(map.shape(), &device, dtype));
+    (losses::<B>(images, map, args), kept)
 }
 
 /// The gradient of [`photometric_tracked`].
-pub(crate) fn photometric_backward<B: SplatBackend>(
+pub(crate) fn photometric_backward<B: Backend>(
     rendered: FloatTensor<B>,
     target: Target<B>,
-    slope: FloatTensor<B>,
-    grad: FloatTensor<B>,
+    kept: FloatTensor<B>,
+    grad_losses: FloatTensor<B>,
 ) -> FloatTensor<B> {
     let (whole, device, dtype) = (rendered.shape(), rendered.device(), rendered.dtype().into());
-    let [x, y] = images::<B>(rendered, target);
+    let SsimTensors { x, y } = images::<B>(rendered, target);
     let shape = x.shape();
     let scalar = |at: usize| {
-        let value = B::float_slice(grad.clone(), &[Slice::from(at..at + 1)]);
+        let value = B::float_slice(grad_losses.clone(), &[Slice::from(at..at + 1)]);
         B::float_reshape(value, Shape::from([1, 1, 1, 1]))
     };
     let count = shape.num_elements() as f64;
@@ -173,7 +175,7 @@ pub(crate) fn photometric_backward<B: SplatBackend>(
     let sign = B::float_sign(B::float_sub(x, y));
     let gradient = B::float_add(
         B::float_mul(sign, l1),
-        B::float_mul(slope, B::float_neg(scalar(1))),
+        B::float_mul(kept, B::float_neg(scalar(1))),
     );
     if whole == shape {
         return gradient;

@@ -2,25 +2,46 @@
 
 use core::marker::PhantomData;
 
-use burn::backend::TensorMetadata;
 use burn::backend::flex::FlexTensor;
-use burn::tensor::TensorData;
+use burn::backend::{Flex, TensorMetadata};
+use burn::tensor::{DType, TensorData};
 use rayon::prelude::*;
 
 use super::buffer::Buffer;
-use super::parts::Uncleared;
 use super::real::Real;
 use super::simd::vectorized;
-use crate::activation::Activation;
+use super::uninit::Uncleared;
+use crate::backend::{ActivationBackend, ActivationOps};
+use crate::composed;
+use crate::settings::Activation;
 
 /// Elements per unit of parallel work.
 const CHUNK: usize = 8192;
 
-pub(super) fn forward<T: Real>(
-    _: PhantomData<T>,
-    x: FlexTensor,
-    function: Activation,
-) -> FlexTensor {
+impl ActivationOps for Flex {
+    fn activation(x: FlexTensor, function: Activation) -> FlexTensor {
+        match x.dtype() {
+            DType::F32 | DType::F64 => in_precision!(x, forward, x, function),
+            _ => composed::activation::<Self>(x, function),
+        }
+    }
+}
+
+impl ActivationBackend for Flex {
+    fn activation_backward(
+        x: FlexTensor,
+        y: FlexTensor,
+        grad_y: FlexTensor,
+        function: Activation,
+    ) -> FlexTensor {
+        match x.dtype() {
+            DType::F32 | DType::F64 => in_precision!(x, backward, x, y, grad_y, function),
+            _ => composed::activation_backward::<Self>(x, y, grad_y, function),
+        }
+    }
+}
+
+fn forward<T: Real>(_: PhantomData<T>, x: FlexTensor, function: Activation) -> FlexTensor {
     let shape = x.shape();
     let x = Buffer::new(x);
     let mut y = Uncleared::<T>::new(shape.num_elements());
@@ -34,7 +55,7 @@ pub(super) fn forward<T: Real>(
     FlexTensor::from_data(TensorData::new(y.written(), shape))
 }
 
-pub(super) fn backward<T: Real>(
+fn backward<T: Real>(
     _: PhantomData<T>,
     x: FlexTensor,
     y: FlexTensor,

@@ -2,14 +2,15 @@
 
 use core::marker::PhantomData;
 
-use burn::backend::TensorMetadata;
 use burn::backend::flex::FlexTensor;
+use burn::backend::{Flex, TensorMetadata};
 use rayon::prelude::*;
 
 use super::buffer::{Buffer, BufferMut};
 use super::real::Real;
 use super::simd::vectorized;
-use crate::adam::{AdamRows, AdamStep};
+use crate::backend::{AdamInputs, AdamOps, AdamOutputs, AdamTensors, OpInputs};
+use crate::settings::{AdamRows, AdamStep};
 
 /// Elements per unit of parallel work, about.
 const CHUNK: usize = 8192;
@@ -24,12 +25,24 @@ struct Numbers<T> {
     epsilon: T,
 }
 
+impl AdamOps for Flex {
+    fn adam(OpInputs(inputs): AdamInputs<Self>, step: AdamStep) -> AdamOutputs<Self> {
+        in_precision!(inputs.param, self::step, inputs, &step)
+    }
+}
+
 /// Parameter and moments are written into their own memory, unless something else holds that too.
-pub(super) fn step<T: Real>(
+fn step<T: Real>(
     _: PhantomData<T>,
-    [param, grad, moment_1, moment_2]: [FlexTensor; 4],
+    inputs: AdamTensors<FlexTensor>,
     step: &AdamStep,
-) -> [FlexTensor; 3] {
+) -> AdamOutputs<Flex> {
+    let AdamTensors {
+        param,
+        grad,
+        moment_1,
+        moment_2,
+    } = inputs;
     let numbers = Numbers {
         beta_1: T::of(step.beta_1),
         beta_2: T::of(step.beta_2),
@@ -66,7 +79,12 @@ pub(super) fn step<T: Real>(
                 }
             }
         });
-    stepped.map(BufferMut::into_tensor)
+    let [param, moment_1, moment_2] = stepped.map(BufferMut::into_tensor);
+    AdamOutputs {
+        param,
+        moment_1,
+        moment_2,
+    }
 }
 
 vectorized! {
@@ -109,6 +127,11 @@ mod tests {
         FlexTensor::from_data(TensorData::new(values.to_vec(), [values.len() / 2, 2]))
     }
 
+    fn stepped(tensors: [FlexTensor; 4]) -> [FlexTensor; 3] {
+        let stepped = step(PhantomData::<f32>, tensors.into(), &STEP);
+        [stepped.param, stepped.moment_1, stepped.moment_2]
+    }
+
     fn values(tensor: &FlexTensor) -> &[f32] {
         tensor.as_slice().unwrap()
     }
@@ -120,13 +143,13 @@ mod tests {
 
         let alone = tensors();
         let places = [0, 2, 3].map(|i| values(&alone[i]).as_ptr());
-        let stepped = step(PhantomData::<f32>, alone, &STEP);
+        let stepped = self::stepped(alone);
         assert_eq!(places, stepped.each_ref().map(|t| values(t).as_ptr()));
         assert_ne!(values(&stepped[0]), start);
 
         let shared = tensors();
         let held = shared.clone();
-        let again = step(PhantomData::<f32>, shared, &STEP);
+        let again = self::stepped(shared);
         assert_eq!(values(&held[0]), start);
         for (stepped, again) in stepped.iter().zip(&again) {
             assert_eq!(values(stepped), values(again));

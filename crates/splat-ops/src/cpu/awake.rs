@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use rayon::Yield;
 
-/// So long a thread looks for work in vain before it sleeps after all. Ten times what a step of 15,000 Gaussians takes
+/// How long an idle thread spins before it sleeps. Ten times what a step of 15,000 Gaussians takes
 /// outside of the ops at a time (docs/PERFORMANCE.md, stages).
 const PATIENCE: Duration = Duration::from_micros(500);
 
@@ -29,7 +29,7 @@ pub(crate) fn keep_awake() {
 }
 
 fn look_for_work() {
-    // What it finds may be the next request to do so.
+    // It may find the next request to do so.
     if LOOKS.replace(true) {
         return;
     }

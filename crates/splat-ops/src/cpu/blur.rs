@@ -2,17 +2,25 @@
 
 use core::marker::PhantomData;
 
+use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
 use super::buffer::{Buffer, overwritten, tensor};
 use super::real::Real;
 use super::simd::vectorized;
+use crate::backend::BlurOps;
 
 /// Values of a row that are summed at once.
 const LANES: usize = 16;
 
-pub(super) fn blur<T: Real>(_: PhantomData<T>, image: FlexTensor, window: &[f64]) -> FlexTensor {
+impl BlurOps for Flex {
+    fn gaussian_blur(image: FlexTensor, window: Vec<f64>) -> FlexTensor {
+        in_precision!(image, blur, image, &window)
+    }
+}
+
+fn blur<T: Real>(_: PhantomData<T>, image: FlexTensor, window: &[f64]) -> FlexTensor {
     let image = Buffer::new(image);
     let shape: [usize; 4] = image.dims();
     let image = image.slice::<T>();

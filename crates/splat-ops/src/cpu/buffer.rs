@@ -29,7 +29,7 @@ pub(super) fn zeros<T: Overwritten + bytemuck::Pod>(len: usize) -> Vec<T> {
     values
 }
 
-/// What [`overwritten`] memory holds before it is written.
+/// Value of [`overwritten`] memory before it is written.
 pub(crate) trait Overwritten: Copy + Send + Sync {
     /// Zero.
     const CLEAR: Self;

@@ -8,7 +8,7 @@ use macerator::Arch;
 /// A set of instructions that the loops are compiled for; a better one is greater.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum InstructionSet {
-    /// What every processor of the target has; the rasteriser uses SSE 4.2 where there is that.
+    /// The instructions of every processor of the target; the rasteriser uses SSE 4.2 where there is that.
     Baseline,
     /// 64-bit Arm, whose baseline has them.
     Neon,
@@ -71,7 +71,7 @@ pub(super) fn registers() -> Arch {
     {
         let most = MOST.load(Ordering::Relaxed);
         if most < InstructionSet::of(best) as u8 {
-            // What runs AVX-512 runs AVX2, and that what was before.
+            // A processor with AVX-512 has AVX2, and all that came before.
             return match most < InstructionSet::Avx2 as u8 {
                 true => Arch::V2,
                 false => Arch::V3,

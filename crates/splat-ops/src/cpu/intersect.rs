@@ -4,6 +4,7 @@
 //! after the other. Each emits its tiles; a counting sort brings these together tile by tile, and each tile sorts its own
 //! few by (depth, index).
 
+mod by_tile;
 mod emit;
 
 use core::ops::Range;
@@ -11,99 +12,64 @@ use core::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
 use rayon::prelude::*;
 
-use super::buffer::overwritten;
-use super::parts::{Part, Uncleared};
-use super::rasterize::{MOMENTS, Splat, kept_per_pair};
 use super::real::Real;
+use super::splat::Splat;
+use super::tiles::{CHUNK, Grid};
+use super::uninit::Uncleared;
 use crate::OpError;
 use crate::backend::{PROJECTED_EXTENT, PROJECTED_WIDTH};
 use crate::settings::RasterizeArgs;
+use by_tile::ByTile;
 use emit::{Emission, Emitted, emit};
 use splat_core::memory::{in_units, lacking};
-
-/// Side of a tile in pixels.
-pub(super) const TILE: usize = 16;
-
-/// Splats per unit of parallel work.
-pub(super) const CHUNK: usize = 256;
 
 /// Gaussians per unit of the search for those that are seen.
 const SEARCHED: usize = 2048;
 
-/// Parts that the counting sort is done in, at most: each counts the tiles for itself.
-const PARTS: usize = 16;
+/// Intersections of one camera that can be listed: they are counted in 32 bits.
+const MAX_INTERSECTIONS: u64 = u32::MAX as u64;
 
-/// Pairs of a tile and a splat of one camera that can be listed: they are counted in 32 bits.
-const MAX_PAIRS: u64 = u32::MAX as u64;
-
-/// The one place that decides how many pairs are too many. Asked before any list is allocated.
-fn check_pairs(pairs: u64, limit: u64) -> Result<(), OpError> {
-    if pairs <= limit {
+/// The one place that decides how many intersections are too many. Asked before any list is allocated.
+fn check_intersections(intersections: u64, limit: u64) -> Result<(), OpError> {
+    if intersections <= limit {
         return Ok(());
     }
-    Err(OpError::TooManyPairs {
+    Err(OpError::TooManyIntersections {
         op: "rasterize",
-        pairs,
+        intersections,
         limit,
     })
 }
 
-/// Refuses pairs that memory could not hold: the allocation that failed would end the process.
-fn check_memory(pairs: u64, bytes_per_pair: u64) -> Result<(), OpError> {
-    let needed = pairs.saturating_mul(bytes_per_pair);
+/// Refuses intersections that memory could not hold: the allocation that failed would end the process.
+fn check_memory(intersections: u64, bytes_per_intersection: u64) -> Result<(), OpError> {
+    let needed = intersections.saturating_mul(bytes_per_intersection);
     match lacking(needed) {
         None => Ok(()),
         Some(left) => Err(OpError::OutOfMemory {
             op: "rasterize",
-            pairs,
+            intersections,
             needed: in_units(needed),
             left: in_units(left),
         }),
     }
 }
 
-/// Bytes that a pair takes at most at any one time: while the lists are made, or then with what the forward pass keeps of
-/// it and, where a backward pass follows, with its partial gradients.
-fn bytes_per_pair<T: Real>(channels: usize, args: &RasterizeArgs) -> u64 {
-    let number = size_of::<T>();
-    // Tiles of the emission, whose vectors grow by doubling; owners, instances, splats and places.
+/// Bytes that an intersection takes at most at any one time: while the lists are made, or then with the bytes `kept` of it.
+fn bytes_per_intersection(kept: usize) -> u64 {
+    // Tiles of the emission, whose vectors grow by doubling; owners, intersections, splats and places.
     let while_listed = (2 + 4) * size_of::<u32>();
     let listed = 2 * size_of::<u32>();
-    let partials = if args.backward {
-        (MOMENTS + channels) * number
-    } else {
-        0
-    };
-    while_listed.max(listed + kept_per_pair(number) + partials) as u64
+    while_listed.max(listed + kept) as u64
 }
 
 #[cfg(not(test))]
-fn max_pairs() -> u64 {
-    MAX_PAIRS
+fn max_intersections() -> u64 {
+    MAX_INTERSECTIONS
 }
 
 #[cfg(test)]
-use tests::max_pairs;
-
-/// Tiles of an image.
-#[derive(Clone, Copy)]
-pub(super) struct Grid {
-    pub(super) columns: usize,
-    pub(super) rows: usize,
-}
-
-impl Grid {
-    pub(super) fn new(args: &RasterizeArgs) -> Self {
-        Self {
-            columns: (args.size.width as usize).div_ceil(TILE),
-            rows: (args.size.height as usize).div_ceil(TILE),
-        }
-    }
-
-    fn tiles(self) -> usize {
-        self.columns * self.rows
-    }
-}
+use tests::max_intersections;
 
 /// The Gaussians among some that can be seen anywhere: not culled, not too faint, and no NaN decides it. One with a colour
 /// that is not finite is left out too: it would be in every pixel it touches.
@@ -131,26 +97,28 @@ fn visible<T: Real>(
     visible
 }
 
-/// The lists of one camera. An instance is one (splat, tile) pair.
+/// The lists of one camera. An intersection is a splat and a tile that it touches.
 #[derive(Debug)]
 pub(super) struct TileLists {
     /// The Gaussian of each listed splat, ascending.
     pub(super) listed: Vec<u32>,
-    /// The emitted instances of each listed splat end here.
+    /// The emitted intersections of each listed splat end here.
     ends: Vec<u32>,
-    /// Where each emitted instance went when they were sorted by tile and depth.
+    /// Where each emitted intersection went when they were sorted by tile and depth.
     places: Vec<AtomicU32>,
-    /// The listed splat of each instance, sorted by tile, front to back in each tile.
+    /// The listed splat of each intersection, sorted by tile, front to back in each tile.
     splats: Vec<u32>,
-    /// `tiles[t]..tiles[t + 1]`: the sorted instances of tile t, tiles in rows.
+    /// `tiles[t]..tiles[t + 1]`: the sorted intersections of tile t, tiles in rows.
     tiles: Vec<u32>,
 }
 
 impl TileLists {
-    /// Lists for one camera, and its listed splats: packed splats `[N, 9]`, colours `[N, D]` and opacities `[N]`.
+    /// Lists for one camera, and its listed splats: packed splats `[N, 9]`, colours `[N, D]` and opacities `[N]`. Of each
+    /// intersection the caller keeps `kept` bytes.
     pub(super) fn new<T: Real>(
         [packed, colors, opacities]: [&[T]; 3],
         args: &RasterizeArgs,
+        kept: usize,
     ) -> Result<(Self, Vec<Splat<T>>), OpError> {
         let count = opacities.len();
         let visible: Vec<Vec<u32>> = (0..count.div_ceil(SEARCHED))
@@ -179,13 +147,13 @@ impl TileLists {
                 .collect()
         };
         // Where there may be too many they are counted before any is kept.
-        let limit = max_pairs();
-        let each = bytes_per_pair::<T>(colors.len() / count.max(1), args);
+        let limit = max_intersections();
+        let each = bytes_per_intersection(kept);
         let most = listed.len() as u64 * grid.tiles() as u64;
         if most > limit || lacking(most.saturating_mul(each)).is_some() {
-            let pairs = emitted(false).iter().map(|part| part.pairs).sum();
-            check_pairs(pairs, limit)?;
-            check_memory(pairs, each)?;
+            let intersections = emitted(false).iter().map(|part| part.intersections).sum();
+            check_intersections(intersections, limit)?;
+            check_memory(intersections, each)?;
         }
         let emitted = emitted(true);
 
@@ -193,8 +161,8 @@ impl TileLists {
         Ok((lists, splats.written()))
     }
 
-    /// Number of (splat, tile) pairs.
-    pub(super) fn instances(&self) -> usize {
+    /// Number of intersections.
+    pub(super) fn intersections(&self) -> usize {
         self.splats.len()
     }
 
@@ -203,20 +171,20 @@ impl TileLists {
         &self.splats[self.tiles[tile] as usize..self.tiles[tile + 1] as usize]
     }
 
-    /// The sorted instances of a row of tiles.
+    /// The sorted intersections of a row of tiles.
     pub(super) fn row_of_tiles(&self, ty: usize, grid: Grid) -> Range<usize> {
         let [first, last] = [ty, ty + 1].map(|row| self.tiles[row * grid.columns] as usize);
         first..last
     }
 
-    /// The emitted instances of a listed splat.
+    /// The emitted intersections of a listed splat.
     #[inline(always)]
     pub(super) fn emitted(&self, splat: usize) -> Range<usize> {
         let first = splat.checked_sub(1).map_or(0, |before| self.ends[before]);
         first as usize..self.ends[splat] as usize
     }
 
-    /// Where an emitted instance went, if there is one of that number.
+    /// Where an emitted intersection went, if there is one of that number.
     #[inline(always)]
     pub(super) fn place(&self, emitted: usize) -> Option<usize> {
         let place = self.places.get(emitted)?;
@@ -224,180 +192,23 @@ impl TileLists {
     }
 }
 
-/// The emitted instances brought together tile by tile, in the order in which they were emitted.
-struct ByTile {
-    /// By emitted instance: its splat.
-    owners: Vec<u32>,
-    /// Where the emitted instances of each splat end.
-    ends: Vec<u32>,
-    /// The emitted instances by tile.
-    instances: Vec<AtomicU32>,
-    /// Where each tile's begin, and the last one's end.
-    tiles: Vec<u32>,
-}
-
-impl ByTile {
-    /// By a counting sort.
-    fn new(emitted: &[Emitted], splats: usize, grid: Grid) -> Self {
-        let length = emitted.len().div_ceil(PARTS).max(1);
-        let mut counts: Vec<Vec<u32>> = emitted
-            .par_chunks(length)
-            .map(|part| {
-                let mut counts = vec![0; grid.tiles()];
-                for tile in part.iter().flat_map(|emitted| &emitted.tiles) {
-                    counts[*tile as usize] += 1;
-                }
-                counts
-            })
-            .collect();
-        // From how many there are to where they go: tile by tile, and in a tile part by part.
-        let mut tiles = Vec::with_capacity(grid.tiles() + 1);
-        let mut next = 0;
-        for tile in 0..grid.tiles() {
-            tiles.push(next);
-            for counts in &mut counts {
-                let own = core::mem::replace(&mut counts[tile], next);
-                next += own;
-            }
-        }
-        tiles.push(next);
-
-        let instances = unset(next as usize);
-        let mut owners = Uncleared::<u32>::new(next as usize);
-        let mut ends = Uncleared::<u32>::new(splats);
-        let mut start = 0;
-        let of_owners = owners.parts(emitted.iter().map(|emitted| emitted.tiles.len()));
-        let pieces: Vec<Piece> = (emitted.iter().zip(of_owners).zip(ends.chunks(CHUNK)))
-            .zip((0..).step_by(CHUNK))
-            .map(|(((emitted, owners), ends), first)| {
-                let next = start + emitted.tiles.len() as u32;
-                Piece {
-                    emitted,
-                    first,
-                    start: core::mem::replace(&mut start, next),
-                    owners,
-                    ends,
-                }
-            })
-            .collect();
-        pieces
-            .into_par_iter()
-            .chunks(length)
-            .zip(counts)
-            .for_each(|(part, mut next)| {
-                for piece in part {
-                    piece.place(&mut next, &instances);
-                }
-            });
-        Self {
-            owners: owners.written(),
-            ends: ends.written(),
-            instances,
-            tiles,
-        }
-    }
-
-    /// The lists of the given Gaussians: each tile's instances front to back, and in the order of the Gaussians where their
-    /// splats are equally deep.
-    fn sorted<T: Real>(self, listed: Vec<u32>, depths: &[T]) -> TileLists {
-        let count = self.instances.len();
-        let mut splats = Uncleared::<u32>::new(count);
-        let places = unset(count);
-        splats
-            .parts(
-                self.tiles
-                    .windows(2)
-                    .map(|ends| (ends[1] - ends[0]) as usize),
-            )
-            .into_par_iter()
-            .zip(&self.tiles)
-            .for_each_init(Vec::new, |keys, (splats, first)| {
-                let splats = splats.overwritten();
-                keys.clear();
-                // Instances are numbered as the splats are.
-                let instances = &self.instances[*first as usize..][..splats.len()];
-                keys.extend(instances.iter().map(|instance| {
-                    let instance = instance.load(Relaxed);
-                    let depth = depths[self.owners[instance as usize] as usize];
-                    depth.sort_key(instance)
-                }));
-                keys.sort_unstable();
-                for ((splat, place), key) in splats.iter_mut().zip(*first..).zip(&*keys) {
-                    let instance = T::index_of(*key) as usize;
-                    places[instance].store(place, Relaxed);
-                    *splat = self.owners[instance];
-                }
-            });
-        TileLists {
-            listed,
-            ends: self.ends,
-            places,
-            splats: splats.written(),
-            tiles: self.tiles,
-        }
-    }
-}
-
-/// What a chunk of splats emitted, and where that goes.
-struct Piece<'a> {
-    emitted: &'a Emitted,
-    /// The first of the splats.
-    first: u32,
-    /// The first of the instances.
-    start: u32,
-    owners: Part<'a, u32>,
-    ends: Part<'a, u32>,
-}
-
-impl Piece<'_> {
-    /// Puts each instance to the next place of its tile.
-    fn place(self, next: &mut [u32], instances: &[AtomicU32]) {
-        let Emitted { tiles, ends, .. } = self.emitted;
-        // How many splats begin at an instance, and with their sum which splat it is of.
-        let owners = self.owners.cleared();
-        for ((end, own), splat) in self.ends.overwritten().iter_mut().zip(ends).zip(1..) {
-            *end = self.start + own;
-            if let Some(owner) = owners.get_mut(*own as usize) {
-                *owner = splat;
-            }
-        }
-        let mut splat = 0;
-        for owner in owners {
-            splat = splat.max(*owner);
-            *owner = self.first + splat;
-        }
-        // The places of one piece are anywhere, but no two pieces have one in common.
-        for (tile, instance) in tiles.iter().zip(self.start..) {
-            let place = &mut next[*tile as usize];
-            instances[*place as usize].store(instance, Relaxed);
-            *place += 1;
-        }
-    }
-}
-
-/// Memory that several threads write, each its own places. Every place is written before any is read.
-fn unset(len: usize) -> Vec<AtomicU32> {
-    let values = overwritten::<u32>(len).into_iter();
-    values.map(AtomicU32::new).collect()
-}
-
 #[cfg(test)]
 mod tests {
     use core::cell::Cell;
 
     use super::*;
-    use crate::backend::SplatBackend;
+    use crate::backend::{OpInputs, RasterizeBackend, RasterizeTensors};
     use crate::cpu::buffer::tensor;
     use crate::{ImageSize, ProjectSettings, Projected, RasterizeSettings, project, rasterize};
     use burn::backend::Flex;
     use burn::tensor::{Device, Tensor, TensorData};
 
     thread_local! {
-        /// A test on this thread may lower the limit: no test can list 2^32 pairs.
-        static LIMIT: Cell<u64> = const { Cell::new(MAX_PAIRS) };
+        /// A test on this thread may lower the limit: no test can list 2^32 intersections.
+        static LIMIT: Cell<u64> = const { Cell::new(MAX_INTERSECTIONS) };
     }
 
-    pub(super) fn max_pairs() -> u64 {
+    pub(super) fn max_intersections() -> u64 {
         LIMIT.get()
     }
 
@@ -414,14 +225,17 @@ mod tests {
     }
 
     #[test]
-    fn pairs_are_refused_from_the_first_one_that_cannot_be_indexed() {
-        for pairs in [0, 1, 1 << 31, MAX_PAIRS] {
-            assert_eq!(check_pairs(pairs, MAX_PAIRS), Ok(()));
+    fn intersections_are_refused_from_the_first_one_that_cannot_be_indexed() {
+        for intersections in [0, 1, 1 << 31, MAX_INTERSECTIONS] {
+            assert_eq!(
+                check_intersections(intersections, MAX_INTERSECTIONS),
+                Ok(())
+            );
         }
-        for pairs in [1 << 32, (1 << 32) + 5, 1 << 40, u64::MAX] {
-            let error = check_pairs(pairs, MAX_PAIRS).unwrap_err();
+        for intersections in [1 << 32, (1 << 32) + 5, 1 << 40, u64::MAX] {
+            let error = check_intersections(intersections, MAX_INTERSECTIONS).unwrap_err();
             let message = error.to_string();
-            assert!(message.contains(&pairs.to_string()), "{message}");
+            assert!(message.contains(&intersections.to_string()), "{message}");
             assert!(message.contains("4294967295"), "{message}");
         }
     }
@@ -482,7 +296,7 @@ mod tests {
     }
 
     #[test]
-    fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
+    fn too_many_intersections_are_an_error_of_the_op_and_not_a_panic() {
         for tracked in [false, true] {
             let device = Device::flex();
             let device = if tracked { device.autodiff() } else { device };
@@ -500,24 +314,29 @@ mod tests {
                     None,
                     &settings,
                 );
-                LIMIT.set(MAX_PAIRS);
+                LIMIT.set(MAX_INTERSECTIONS);
                 rendered
             };
-            let pairs = match render(0) {
-                Err(OpError::TooManyPairs {
-                    pairs, limit: 0, ..
-                }) => pairs,
+            let intersections = match render(0) {
+                Err(OpError::TooManyIntersections {
+                    intersections,
+                    limit: 0,
+                    ..
+                }) => intersections,
                 other => panic!("{other:?}"),
             };
             // Fewer than the nine tiles of the bounding box: what counts is what would be listed.
-            assert!((3..9).contains(&pairs), "{pairs} pairs");
-            assert!(render(pairs).is_ok());
+            assert!(
+                (3..9).contains(&intersections),
+                "{intersections} intersections"
+            );
+            assert!(render(intersections).is_ok());
             assert_eq!(
-                render(pairs - 1).unwrap_err(),
-                OpError::TooManyPairs {
+                render(intersections - 1).unwrap_err(),
+                OpError::TooManyIntersections {
                     op: "rasterize",
-                    pairs,
-                    limit: pairs - 1
+                    intersections,
+                    limit: intersections - 1
                 }
             );
         }
@@ -527,26 +346,21 @@ mod tests {
     fn an_image_that_was_not_rendered_is_zero_and_so_are_its_gradients() {
         let args = small_picture();
         let row = vec![1.0f32, 1.0, 1.0, 1.0, 0.0, 1.0, 1.0, 3.0, 3.0];
-        let inputs = || {
-            (
-                tensor(row.clone(), [1, 1, PROJECTED_WIDTH]),
-                tensor(vec![1.0f32], [1, 1, 1]),
-                tensor(vec![0.5f32], [1, 1]),
-                Some(tensor(vec![1.0f32], [1, 1])),
-            )
-        };
+        let inputs = OpInputs(RasterizeTensors {
+            packed: tensor(row, [1, 1, PROJECTED_WIDTH]),
+            colors: tensor(vec![1.0f32], [1, 1, 1]),
+            opacities: tensor(vec![0.5f32], [1, 1]),
+            background: Some(tensor(vec![1.0f32], [1, 1])),
+        });
         LIMIT.set(0);
-        let (packed, colors, opacities, background) = inputs();
-        let (image, state) = Flex::rasterize_forward(packed, colors, opacities, background, &args);
-        LIMIT.set(MAX_PAIRS);
+        let (image, state) = Flex::rasterize_tracked(inputs.clone(), &args);
+        LIMIT.set(MAX_INTERSECTIONS);
         assert!(args.errors.error().is_some());
         assert_eq!(image.as_slice::<f32>(), Some(&[0.0; 12][..]));
 
-        let (packed, colors, opacities, background) = inputs();
         let grad = tensor(vec![1.0f32; 12], [1, 2, 3, 2]);
-        let grads = Flex::rasterize_backward(
-            packed, colors, opacities, background, image, state, grad, &args, [true; 4],
-        );
+        let grads = Flex::rasterize_backward(inputs, state, grad, &args, [true; 4].into());
+        let grads: [_; 4] = grads.into();
         for (grad, length) in grads.iter().zip([PROJECTED_WIDTH, 1, 1, 1]) {
             let grad = grad.as_ref().and_then(|grad| grad.as_slice::<f32>());
             assert_eq!(grad, Some(&vec![0.0; length][..]));

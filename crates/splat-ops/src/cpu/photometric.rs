@@ -13,10 +13,10 @@ use burn::backend::{Flex, TensorMetadata};
 use rayon::prelude::*;
 
 use super::buffer::{Buffer, tensor};
-use super::parts::{Part, Uncleared};
 use super::real::Real;
-use crate::backend::Target;
-use crate::ssim::SsimArgs;
+use super::uninit::{Part, Uncleared};
+use crate::backend::{PhotometricBackend, PhotometricOps, Target};
+use crate::settings::SsimArgs;
 use pictures::{Pictures, spread};
 use sweep::{Scratch, Sweep};
 
@@ -24,8 +24,34 @@ use sweep::{Scratch, Sweep};
 /// rows dear; many leave nothing to share out at the end.
 const BAND: RangeInclusive<usize> = 32..=128;
 
+impl PhotometricOps for Flex {
+    fn photometric(rendered: FlexTensor, target: Target<Self>, args: SsimArgs) -> FlexTensor {
+        in_precision!(rendered, measure, rendered, target, &args)
+    }
+}
+
+impl PhotometricBackend for Flex {
+    fn photometric_tracked(
+        rendered: FlexTensor,
+        target: Target<Self>,
+        args: &SsimArgs,
+    ) -> (FlexTensor, FlexTensor) {
+        in_precision!(rendered, measure_tracked, rendered, target, args)
+    }
+
+    fn photometric_backward(
+        rendered: FlexTensor,
+        target: Target<Self>,
+        kept: FlexTensor,
+        grad_losses: FlexTensor,
+        _args: &SsimArgs,
+    ) -> FlexTensor {
+        in_precision!(rendered, backward, rendered, target, kept, grad_losses)
+    }
+}
+
 /// The mean absolute difference, and one less the mean similarity: `[2]`.
-pub(super) fn measure<T: Real>(
+fn measure<T: Real>(
     _: PhantomData<T>,
     rendered: FlexTensor,
     target: Target<Flex>,
@@ -35,7 +61,7 @@ pub(super) fn measure<T: Real>(
 }
 
 /// The same, and the gradient of the mean similarity.
-pub(super) fn measure_tracked<T: Real>(
+fn measure_tracked<T: Real>(
     _: PhantomData<T>,
     rendered: FlexTensor,
     target: Target<Flex>,
@@ -107,7 +133,7 @@ struct Band<'a, T> {
 }
 
 /// Gradient of `rendered`, given that of the means and what [`measure_tracked`] left.
-pub(super) fn backward<T: Real>(
+fn backward<T: Real>(
     _: PhantomData<T>,
     rendered: FlexTensor,
     target: Target<Flex>,

@@ -16,22 +16,28 @@
 //! V and e are taken in units of the splat's own size (`k` pixels), so that nothing over- or underflows, be the splat
 //! a millionth of a pixel or a million pictures wide.
 
+mod camera;
 mod gradient;
 mod splat;
 
 use core::marker::PhantomData;
 use core::ops::Range;
 
+use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
+use self::camera::Camera;
 use self::gradient::splat_backward;
-use self::splat::{Camera, Gaussian, Splat};
+use self::splat::{Gaussian, Splat};
 use super::buffer::{Buffer, tensor};
-use super::parts::Uncleared;
 use super::real::Real;
 use super::simd::{LANES, Lanes, for_each_block, vectorized};
-use crate::backend::PROJECTED_WIDTH;
+use super::uninit::Uncleared;
+use crate::backend::{
+    OpInputs, PROJECTED_WIDTH, ProjectBackend, ProjectGradients, ProjectInputs, ProjectOps,
+    ProjectTensors,
+};
 use crate::settings::ProjectArgs;
 
 /// Gaussians per unit of parallel work. Fixed, so that sums over Gaussians have a fixed order.
@@ -52,13 +58,13 @@ struct Inputs<'a, T> {
 }
 
 impl<'a, T: Real> Inputs<'a, T> {
-    fn new(buffers: &'a [Buffer; 5], args: &ProjectArgs) -> Self {
-        let [means, quats, scales, viewmats, intrinsics] =
-            buffers.each_ref().map(|buffer| buffer.slice::<T>());
+    fn new(buffers: &'a ProjectTensors<Buffer>, args: &ProjectArgs) -> Self {
+        let viewmats = buffers.viewmats.slice::<T>();
+        let intrinsics = buffers.intrinsics.slice::<T>();
         Self {
-            means,
-            quats,
-            scales,
+            means: buffers.means.slice(),
+            quats: buffers.quats.slice(),
+            scales: buffers.scales.slice(),
             cameras: viewmats
                 .chunks_exact(16)
                 .zip(intrinsics.chunks_exact(4))
@@ -119,9 +125,33 @@ vectorized! {
     }
 }
 
-pub(super) fn forward<T: Real>(
+impl ProjectOps for Flex {
+    fn project(OpInputs(inputs): ProjectInputs<Self>, args: ProjectArgs) -> FlexTensor {
+        in_precision!(inputs.means, forward, inputs, &args)
+    }
+}
+
+impl ProjectBackend for Flex {
+    fn project_backward(
+        OpInputs(inputs): ProjectInputs<Self>,
+        grad_packed: FlexTensor,
+        args: &ProjectArgs,
+        needs_grad: ProjectTensors<bool>,
+    ) -> ProjectGradients<Self> {
+        in_precision!(
+            inputs.means,
+            backward,
+            inputs,
+            grad_packed,
+            args,
+            needs_grad
+        )
+    }
+}
+
+fn forward<T: Real>(
     _: PhantomData<T>,
-    inputs: [FlexTensor; 5],
+    inputs: ProjectTensors<FlexTensor>,
     args: &ProjectArgs,
 ) -> FlexTensor {
     let buffers = inputs.map(Buffer::new);
@@ -186,7 +216,7 @@ fn lanes_backward<T: Real, const OF_CAMERA: bool>(
         );
         let kept = |value: T| if splat.visible { value } else { T::ZERO };
         for i in 0..3 {
-            gradients[i][lane] = kept(g.mean[i]);
+            gradients[i][lane] = kept(g.camera.mean[i]);
             gradients[7 + i][lane] = kept(g.scale[i]);
         }
         for i in 0..4 {
@@ -195,12 +225,12 @@ fn lanes_backward<T: Real, const OF_CAMERA: bool>(
         if OF_CAMERA {
             for i in 0..3 {
                 for j in 0..3 {
-                    of_camera[3 * i + j][lane] += kept(g.w[i][j]);
+                    of_camera[3 * i + j][lane] += kept(g.camera.w[i][j]);
                 }
-                of_camera[9 + i][lane] += kept(g.t[i]);
+                of_camera[9 + i][lane] += kept(g.camera.t[i]);
             }
             for i in 0..4 {
-                of_camera[12 + i][lane] += kept(g.intrinsics[i]);
+                of_camera[12 + i][lane] += kept(g.camera.intrinsics[i]);
             }
         }
     }
@@ -264,13 +294,13 @@ impl<T: Real> Chunk<'_, T> {
     }
 }
 
-pub(super) fn backward<T: Real>(
+fn backward<T: Real>(
     _: PhantomData<T>,
-    inputs: [FlexTensor; 5],
+    inputs: ProjectTensors<FlexTensor>,
     grad_packed: FlexTensor,
     args: &ProjectArgs,
-    wanted: [bool; 5],
-) -> [Option<FlexTensor>; 5] {
+    needs_grad: ProjectTensors<bool>,
+) -> ProjectGradients<Flex> {
     let buffers = inputs.map(Buffer::new);
     let inputs = Inputs::<T>::new(&buffers, args);
     let grad = Buffer::new(grad_packed);
@@ -290,7 +320,7 @@ pub(super) fn backward<T: Real>(
                 means: means.cleared(),
                 quats: quats.cleared(),
                 scales: scales.cleared(),
-                of_cameras: wanted[3] || wanted[4],
+                of_cameras: needs_grad.viewmats || needs_grad.intrinsics,
             };
             let views = inputs
                 .cameras
@@ -311,16 +341,18 @@ pub(super) fn backward<T: Real>(
         }
     }
     let [means, quats, scales] = [means, quats, scales].map(Uncleared::written);
-    [
-        wanted[0].then(|| tensor(means, [n, 3])),
-        wanted[1].then(|| tensor(quats, [n, 4])),
-        wanted[2].then(|| tensor(scales, [n, 3])),
-        wanted[3].then(|| tensor(viewmat_gradients(&cameras), [c, 4, 4])),
-        wanted[4].then(|| {
+    ProjectTensors {
+        means: needs_grad.means.then(|| tensor(means, [n, 3])),
+        quats: needs_grad.quats.then(|| tensor(quats, [n, 4])),
+        scales: needs_grad.scales.then(|| tensor(scales, [n, 3])),
+        viewmats: needs_grad
+            .viewmats
+            .then(|| tensor(viewmat_gradients(&cameras), [c, 4, 4])),
+        intrinsics: needs_grad.intrinsics.then(|| {
             let values = cameras.iter().flat_map(|camera| &camera[12..]).copied();
             tensor(values.collect(), [c, 4])
         }),
-    ]
+    }
 }
 
 fn viewmat_gradients<T: Real>(cameras: &[[T; CAMERA]]) -> Vec<T> {

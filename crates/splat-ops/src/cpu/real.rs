@@ -7,6 +7,10 @@ use core::ops::{Add, AddAssign, Div, Mul, Neg, Sub, SubAssign};
 use burn::tensor::Element;
 use macerator::{Scalar, Simd, VAdd, VMaskReduce, VMul, VMulAdd, VOrd, VSelect, VSub, Vector};
 
+use splat_core::exp::{
+    EXP, EXP_LN2_HIGH, EXP_LN2_LOW, EXP2_NEG as EXP2, ROUND_TO_INTEGER as ROUND,
+};
+
 use super::buffer::Overwritten;
 
 /// f32 or f64. Only what the ops need; every method is inlined so that loops over lanes vectorise.
@@ -38,7 +42,7 @@ pub(crate) trait Real:
 {
     const ZERO: Self;
     const ONE: Self;
-    /// What [`sort_key`](Self::sort_key) makes.
+    /// Type of [`sort_key`](Self::sort_key).
     type SortKey: Ord + Copy + Send + Sync;
 
     /// An integer that sorts as the number does (negative ones too), and equal numbers as `index` does.
@@ -254,20 +258,6 @@ impl Real for f32 {
     }
 }
 
-/// 1.5 * 2^23: adding it rounds to the nearest integer and leaves that integer in the low bits.
-const ROUND: f32 = 12_582_912.0;
-
-/// Coefficients from degree 5 down. They are those of the kernels too (`splat_kernels::exp`): the
-/// polynomial with p(0) = 1 whose largest relative error from `2^-g` on `|g| <= 1/2` is least, 1.1e-7.
-const EXP2: [f32; 6] = [
-    -0.001_326_472_7,
-    0.009_671_513,
-    -0.055_507_336,
-    0.240_222_42,
-    -0.693_146_94,
-    1.0,
-];
-
 /// `2^-t` as `2^n 2^-g` with `|g| <= 1/2`: g is exact, and a polynomial stands for `2^-g`. Against f64 on [0, 24]: relative
 /// error below 2e-7 (see the test), fused or not.
 // Step by step for all registers: what follows in one waits for what came before, and a processor looks only so far ahead for
@@ -313,22 +303,12 @@ fn polynomial<const FMA: bool>([c5, rest @ ..]: &[f32; 6], x: f32) -> f32 {
     sum
 }
 
-/// As [`EXP2`], of `e^r` on `|r| <= ln(2) / 2`, 9.1e-8.
-const EXP: [f32; 6] = [
-    0.008_290_315,
-    0.041_897_93,
-    0.166_676_36,
-    0.499_991_5,
-    0.999_999_7,
-    1.0,
-];
-
 /// `exp(x) = 2^n e^r` for any x: infinite and zero where that is out of range, NaN for NaN.
 #[inline(always)]
 fn exp_f32<const FMA: bool>(x: f32) -> f32 {
     // ln(2) in two parts; the first has so few bits that n * LN2_HIGH is exact.
-    const LN2_HIGH: f32 = 0.693_359_4;
-    const LN2_LOW: f32 = -2.121_944_4e-4;
+    const LN2_HIGH: f32 = EXP_LN2_HIGH as f32 / 512.0;
+    const LN2_LOW: f32 = EXP_LN2_LOW;
     let multiply_add = f32::multiply_add::<FMA>;
 
     // Beyond these the result is infinite or zero anyway. Written so that NaN passes both.

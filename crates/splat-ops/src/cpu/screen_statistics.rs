@@ -2,13 +2,16 @@
 
 use core::marker::PhantomData;
 
-use burn::backend::TensorMetadata;
 use burn::backend::flex::FlexTensor;
+use burn::backend::{Flex, TensorMetadata};
 use rayon::prelude::*;
 
 use super::buffer::BufferMut;
 use super::real::Real;
-use crate::backend::PROJECTED_EXTENT;
+use crate::backend::{
+    OpInputs, PROJECTED_EXTENT, ScreenProbeOps, ScreenStatisticsInputs, ScreenStatisticsOps,
+    ScreenStatisticsOutputs, ScreenStatisticsTensors,
+};
 
 /// Gaussians per unit of parallel work, at least.
 const CHUNK: usize = 4096;
@@ -37,11 +40,28 @@ impl<'a, T: Real> Rows<'a, T> {
     }
 }
 
-pub(super) fn add<T: Real>(
+impl ScreenProbeOps for Flex {}
+
+impl ScreenStatisticsOps for Flex {
+    fn add_screen_statistics(
+        OpInputs(inputs): ScreenStatisticsInputs<Self>,
+        half: [f64; 2],
+    ) -> ScreenStatisticsOutputs<Self> {
+        in_precision!(inputs.gradient, add, inputs, half)
+    }
+}
+
+fn add<T: Real>(
     _: PhantomData<T>,
-    [gradient, packed, gradients, views]: [FlexTensor; 4],
+    inputs: ScreenStatisticsTensors<FlexTensor>,
     half: [f64; 2],
-) -> [FlexTensor; 2] {
+) -> ScreenStatisticsOutputs<Flex> {
+    let ScreenStatisticsTensors {
+        gradient,
+        packed,
+        gradients,
+        views,
+    } = inputs;
     let cameras = gradient.shape()[0];
     // A flipped view would have strides below zero.
     let [gradient, packed] = [gradient, packed].map(|tensor| {
@@ -66,7 +86,7 @@ pub(super) fn add<T: Real>(
                 if packed.at(c, n, PROJECTED_EXTENT) > T::ZERO {
                     let (x, y) = (gradient.at(c, n, 0) * width, gradient.at(c, n, 1) * height);
                     let length = (x * x + y * y).sqrt();
-                    // What is not finite must not hide the other views of the same Gaussian.
+                    // One that is not finite must not hide the other views of the same Gaussian.
                     sum += if length.is_finite() { length } else { T::ZERO };
                     count += T::ONE;
                 }
@@ -74,5 +94,6 @@ pub(super) fn add<T: Real>(
             *total += sum;
             *views += count;
         });
-    sums.map(BufferMut::into_tensor)
+    let [gradients, views] = sums.map(BufferMut::into_tensor);
+    ScreenStatisticsOutputs { gradients, views }
 }

@@ -5,32 +5,23 @@
 
 use core::marker::PhantomData;
 
+use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
+use splat_core::{SH_C0 as C0, SH_C1 as C1, SH_C2 as C2, SH_C3 as C3};
 
 use super::buffer::{Buffer, overwritten, tensor, zeros};
 use super::math::{Vec3, dot, largest, over, scale};
 use super::real::Real;
+use crate::backend::{
+    OpInputs, SphericalHarmonicsBackend, SphericalHarmonicsGradients, SphericalHarmonicsInputs,
+    SphericalHarmonicsOps, SphericalHarmonicsTensors,
+};
 use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
 
 pub(super) const COUNT_MAX: usize = sh_coefficient_count(SH_DEGREE_MAX);
 /// Gaussians per unit of parallel work.
 const CHUNK: usize = 512;
-
-const C0: f64 = 0.282_094_791_773_878_14;
-const C1: f64 = 0.488_602_511_902_919_9;
-const C2: [f64; 3] = [
-    1.092_548_430_592_079_2,
-    0.315_391_565_252_520_05,
-    0.546_274_215_296_039_6,
-];
-const C3: [f64; 5] = [
-    0.590_043_589_926_643_5,
-    2.890_611_442_640_554,
-    0.457_045_799_464_465_8,
-    0.373_176_332_590_115_4,
-    1.445_305_721_320_277,
-];
 
 /// Values of the first `(degree + 1)^2` basis functions in a unit direction; the rest is zero.
 #[inline(always)]
@@ -131,13 +122,39 @@ fn direction<T: Real>(dirs: &[T], row: usize) -> Vec3<T> {
     core::array::from_fn(|i| dirs[3 * row + i])
 }
 
-pub(super) fn forward<T: Real>(
+impl SphericalHarmonicsOps for Flex {
+    fn spherical_harmonics(
+        OpInputs(inputs): SphericalHarmonicsInputs<Self>,
+        degree: usize,
+    ) -> FlexTensor {
+        in_precision!(inputs.coeffs, forward, inputs, degree)
+    }
+}
+
+impl SphericalHarmonicsBackend for Flex {
+    fn spherical_harmonics_backward(
+        OpInputs(inputs): SphericalHarmonicsInputs<Self>,
+        grad_colors: FlexTensor,
+        degree: usize,
+        needs_grad: SphericalHarmonicsTensors<bool>,
+    ) -> SphericalHarmonicsGradients<Self> {
+        in_precision!(
+            inputs.coeffs,
+            backward,
+            inputs,
+            grad_colors,
+            degree,
+            needs_grad
+        )
+    }
+}
+
+fn forward<T: Real>(
     _: PhantomData<T>,
-    coeffs: FlexTensor,
-    dirs: FlexTensor,
+    inputs: SphericalHarmonicsTensors<FlexTensor>,
     degree: usize,
 ) -> FlexTensor {
-    let (coeffs, dirs) = (Buffer::new(coeffs), Buffer::new(dirs));
+    let SphericalHarmonicsTensors { coeffs, dirs } = inputs.map(Buffer::new);
     let [n, k, _] = coeffs.dims();
     let [c, _, _] = dirs.dims();
     let (coeffs, dirs) = (coeffs.slice::<T>(), dirs.slice::<T>());
@@ -179,15 +196,15 @@ pub(super) fn guarded_dot<T: Real>(grad: Vec3<T>, coeff: Vec3<T>) -> T {
     sum
 }
 
-pub(super) fn backward<T: Real>(
+fn backward<T: Real>(
     _: PhantomData<T>,
-    coeffs: FlexTensor,
-    dirs: FlexTensor,
+    inputs: SphericalHarmonicsTensors<FlexTensor>,
     grad: FlexTensor,
     degree: usize,
-    wanted: [bool; 2],
-) -> [Option<FlexTensor>; 2] {
-    let (coeffs, dirs, grad) = (Buffer::new(coeffs), Buffer::new(dirs), Buffer::new(grad));
+    needs_grad: SphericalHarmonicsTensors<bool>,
+) -> SphericalHarmonicsGradients<Flex> {
+    let SphericalHarmonicsTensors { coeffs, dirs } = inputs.map(Buffer::new);
+    let grad = Buffer::new(grad);
     let [n, k, _] = coeffs.dims();
     let [c, _, _] = dirs.dims();
     let (coeffs, dirs, grad) = (coeffs.slice::<T>(), dirs.slice::<T>(), grad.slice::<T>());
@@ -195,7 +212,7 @@ pub(super) fn backward<T: Real>(
 
     // color = sum_i B_i(d) coeff_i: a coefficient's gradient is B_i(d) times the colour's, summed
     // over the cameras.
-    let grad_coeffs = wanted[0].then(|| {
+    let grad_coeffs = needs_grad.coeffs.then(|| {
         let mut values = zeros::<T>(n * k * 3);
         values
             .par_chunks_mut(k * 3)
@@ -220,7 +237,7 @@ pub(super) fn backward<T: Real>(
     });
 
     // d = v / |v|: the gradient of v is what is tangential, divided by |v|.
-    let grad_dirs = wanted[1].then(|| {
+    let grad_dirs = needs_grad.dirs.then(|| {
         let mut values = overwritten::<T>(c * n * 3);
         values
             .par_chunks_mut(3)
@@ -249,5 +266,8 @@ pub(super) fn backward<T: Real>(
             });
         tensor(values, [c, n, 3])
     });
-    [grad_coeffs, grad_dirs]
+    SphericalHarmonicsTensors {
+        coeffs: grad_coeffs,
+        dirs: grad_dirs,
+    }
 }

@@ -1,38 +1,39 @@
 //! Activations on CubeCL devices.
 
+use burn::tensor::DType;
+use burn_cubecl::CubeBackend;
 use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::activation as kernels;
 
 use super::{buffer, prepare, taken};
-use crate::activation::Activation;
+use crate::backend::{ActivationBackend, ActivationOps};
+use crate::composed;
+use crate::settings::Activation;
 
-fn kernel(function: Activation) -> kernels::Activation {
-    match function {
-        Activation::Exp => kernels::Activation::Exp,
-        Activation::Sigmoid => kernels::Activation::Sigmoid,
+impl ActivationOps for CubeBackend {
+    fn activation(x: CubeTensor, function: Activation) -> CubeTensor {
+        if x.dtype != DType::F32 {
+            return composed::activation::<Self>(x, function);
+        }
+        let client = x.client.clone();
+        let (x, tensor) = taken(prepare(x));
+        tensor(kernels::activate(&client, x, function))
     }
 }
 
-/// The function of every element.
-pub(super) fn forward(x: CubeTensor, function: Activation) -> CubeTensor {
-    let client = x.client.clone();
-    let (x, tensor) = taken(prepare(x));
-    tensor(kernels::activate(&client, x, kernel(function)))
-}
-
-/// The gradient of `x`.
-pub(super) fn backward(
-    [x, y]: [CubeTensor; 2],
-    grad: CubeTensor,
-    function: Activation,
-) -> CubeTensor {
-    let [x, y] = [x, y].map(prepare);
-    let (grad, tensor) = taken(prepare(grad));
-    let known = [&buffer(&x), &buffer(&y)];
-    tensor(kernels::activate_vjp(
-        &x.client,
-        known,
-        grad,
-        kernel(function),
-    ))
+impl ActivationBackend for CubeBackend {
+    fn activation_backward(
+        x: CubeTensor,
+        y: CubeTensor,
+        grad_y: CubeTensor,
+        function: Activation,
+    ) -> CubeTensor {
+        if x.dtype != DType::F32 {
+            return composed::activation_backward::<Self>(x, y, grad_y, function);
+        }
+        let [x, y] = [x, y].map(prepare);
+        let (grad, tensor) = taken(prepare(grad_y));
+        let known = [&buffer(&x), &buffer(&y)];
+        tensor(kernels::activate_vjp(&x.client, known, grad, function))
+    }
 }

@@ -12,9 +12,9 @@ use splat_kernels::photometric::{
 };
 
 use super::{buffer, prepare, tensor};
-use crate::backend::Target;
+use crate::backend::{PhotometricBackend, PhotometricOps, Target};
 use crate::composed;
-use crate::ssim::SsimArgs;
+use crate::settings::SsimArgs;
 
 fn shape(rendered: &CubeTensor, target: &Target<CubeBackend>, args: &SsimArgs) -> PhotometricShape {
     let target = match target {
@@ -81,63 +81,59 @@ fn words(target: Target<CubeBackend>) -> (Buffer, TargetKind) {
     (memory, kind)
 }
 
-/// Means `[2]`.
-pub(super) fn measure(
-    rendered: CubeTensor,
-    target: Target<CubeBackend>,
-    args: &SsimArgs,
-) -> CubeTensor {
-    let shape = shape(&rendered, &target, args);
-    if !shape.fits(&rendered.client) {
-        return composed::photometric::<CubeBackend>(rendered, target, args);
+impl PhotometricOps for CubeBackend {
+    fn photometric(rendered: CubeTensor, target: Target<Self>, args: SsimArgs) -> CubeTensor {
+        let shape = shape(&rendered, &target, &args);
+        if !shape.fits(&rendered.client) {
+            return composed::photometric::<Self>(rendered, target, &args);
+        }
+        let pictures = Pictures::new(rendered, target);
+        let rendered = &pictures.rendered;
+        let losses = photometric(&rendered.client, pictures.images(), &shape);
+        tensor(rendered, losses, Shape::from([2]))
     }
-    let pictures = Pictures::new(rendered, target);
-    let rendered = &pictures.rendered;
-    let means = photometric(&rendered.client, pictures.images(), &shape);
-    tensor(rendered, means, Shape::from([2]))
 }
 
-/// The same, and what the gradient needs.
-pub(super) fn measure_tracked(
-    rendered: CubeTensor,
-    target: Target<CubeBackend>,
-    args: &SsimArgs,
-) -> (CubeTensor, CubeTensor) {
-    let shape = shape(&rendered, &target, args);
-    if !shape.fits(&rendered.client) {
-        return composed::photometric_tracked::<CubeBackend>(rendered, target, args);
+impl PhotometricBackend for CubeBackend {
+    fn photometric_tracked(
+        rendered: CubeTensor,
+        target: Target<Self>,
+        args: &SsimArgs,
+    ) -> (CubeTensor, CubeTensor) {
+        let shape = shape(&rendered, &target, args);
+        if !shape.fits(&rendered.client) {
+            return composed::photometric_tracked::<Self>(rendered, target, args);
+        }
+        let pictures = Pictures::new(rendered, target);
+        let rendered = &pictures.rendered;
+        let (losses, kept) = photometric_tracked(&rendered.client, pictures.images(), &shape);
+        let sizes = [3, shape.images, shape.channels, shape.height, shape.width];
+        (
+            tensor(rendered, losses, Shape::from([2])),
+            tensor(rendered, kept, Shape::from(sizes)),
+        )
     }
-    let pictures = Pictures::new(rendered, target);
-    let rendered = &pictures.rendered;
-    let (means, kept) = photometric_tracked(&rendered.client, pictures.images(), &shape);
-    let sizes = [3, shape.images, shape.channels, shape.height, shape.width];
-    (
-        tensor(rendered, means, Shape::from([2])),
-        tensor(rendered, kept, Shape::from(sizes)),
-    )
-}
 
-/// Gradient `[B, H, W, E]` of what was rendered.
-pub(super) fn backward(
-    rendered: CubeTensor,
-    target: Target<CubeBackend>,
-    kept: CubeTensor,
-    grad: CubeTensor,
-    args: &SsimArgs,
-) -> CubeTensor {
-    let shape = shape(&rendered, &target, args);
-    if !shape.fits(&rendered.client) {
-        return composed::photometric_backward::<CubeBackend>(rendered, target, kept, grad);
+    fn photometric_backward(
+        rendered: CubeTensor,
+        target: Target<Self>,
+        kept: CubeTensor,
+        grad_losses: CubeTensor,
+        args: &SsimArgs,
+    ) -> CubeTensor {
+        let shape = shape(&rendered, &target, args);
+        if !shape.fits(&rendered.client) {
+            return composed::photometric_backward::<Self>(rendered, target, kept, grad_losses);
+        }
+        let pictures = Pictures::new(rendered, target);
+        let rendered = &pictures.rendered;
+        let gradient = photometric_vjp(
+            &rendered.client,
+            pictures.images(),
+            &buffer(&kept),
+            &buffer(&prepare(grad_losses)),
+            &shape,
+        );
+        tensor(rendered, gradient, rendered.shape())
     }
-    let pictures = Pictures::new(rendered, target);
-    let rendered = &pictures.rendered;
-    let grad = prepare(grad);
-    let gradient = photometric_vjp(
-        &rendered.client,
-        pictures.images(),
-        &buffer(&kept),
-        &buffer(&grad),
-        &shape,
-    );
-    tensor(rendered, gradient, rendered.shape())
 }

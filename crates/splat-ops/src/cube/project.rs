@@ -2,67 +2,49 @@
 
 use burn::backend::TensorMetadata;
 use burn::tensor::Shape;
+use burn_cubecl::CubeBackend;
 use burn_cubecl::tensor::CubeTensor;
-use splat_kernels::project::{ProjectInputs, ProjectSettings, project, project_backward};
+use splat_kernels::project::{project, project_backward};
 
-use super::{buffer, prepare, tensor};
-use crate::backend::PROJECTED_WIDTH;
+use super::{buffer, gradients, prepare, tensor};
+use crate::backend::{
+    OpInputs, PROJECTED_WIDTH, ProjectBackend, ProjectGradients, ProjectInputs, ProjectOps,
+    ProjectTensors,
+};
 use crate::settings::ProjectArgs;
 
-fn settings(args: &ProjectArgs) -> ProjectSettings {
-    ProjectSettings {
-        width: args.size.width,
-        height: args.size.height,
-        near: args.settings.near as f32,
-        far: args.settings.far as f32,
-        eps2d: args.settings.eps2d as f32,
-        clamp_margin: args.settings.clamp_margin as f32,
-        alpha_min: args.settings.alpha_min as f32,
+impl ProjectOps for CubeBackend {
+    fn project(OpInputs(inputs): ProjectInputs<Self>, args: ProjectArgs) -> CubeTensor {
+        let inputs = inputs.map(prepare);
+        let means = &inputs.means;
+        let shape = [
+            inputs.viewmats.shape()[0],
+            means.shape()[0],
+            PROJECTED_WIDTH,
+        ];
+        let buffers = inputs.clone().map(|input| buffer(&input));
+        let packed = project(&means.client, &buffers, args.size, &args.settings);
+        tensor(means, packed, Shape::from(shape))
     }
 }
 
-fn inputs(tensors: &[CubeTensor; 5]) -> ProjectInputs {
-    let [means, quats, scales, viewmats, intrinsics] = tensors.each_ref().map(buffer);
-    ProjectInputs {
-        means,
-        quats,
-        scales,
-        viewmats,
-        intrinsics,
+impl ProjectBackend for CubeBackend {
+    fn project_backward(
+        OpInputs(inputs): ProjectInputs<Self>,
+        grad_packed: CubeTensor,
+        args: &ProjectArgs,
+        needs_grad: ProjectTensors<bool>,
+    ) -> ProjectGradients<Self> {
+        let inputs = inputs.map(prepare);
+        let grad_packed = prepare(grad_packed);
+        let grads = project_backward(
+            &grad_packed.client,
+            &inputs.clone().map(|input| buffer(&input)),
+            &buffer(&grad_packed),
+            args.size,
+            &args.settings,
+            needs_grad,
+        );
+        gradients(grads.into(), inputs.inputs().into()).into()
     }
-}
-
-/// Packed splats `[C, N, 9]`.
-pub(super) fn forward(tensors: [CubeTensor; 5], args: &ProjectArgs) -> CubeTensor {
-    let tensors = tensors.map(prepare);
-    let shape = [
-        tensors[3].shape()[0],
-        tensors[0].shape()[0],
-        PROJECTED_WIDTH,
-    ];
-    let means = &tensors[0];
-    let packed = project(&means.client, &inputs(&tensors), &settings(args));
-    tensor(means, packed, Shape::from(shape))
-}
-
-/// The wanted gradients of the five inputs.
-pub(super) fn backward(
-    tensors: [CubeTensor; 5],
-    grad_packed: CubeTensor,
-    args: &ProjectArgs,
-    wanted: [bool; 5],
-) -> [Option<CubeTensor>; 5] {
-    let tensors = tensors.map(prepare);
-    let grad_packed = prepare(grad_packed);
-    let mut grads = project_backward(
-        &grad_packed.client,
-        &inputs(&tensors),
-        &buffer(&grad_packed),
-        &settings(args),
-        wanted,
-    );
-    core::array::from_fn(|i| {
-        let grad = grads[i].take()?;
-        Some(tensor(&tensors[i], grad, tensors[i].shape()))
-    })
 }

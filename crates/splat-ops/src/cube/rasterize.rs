@@ -8,26 +8,16 @@ use burn_cubecl::tensor::CubeTensor;
 use cubecl::client::Client;
 use splat_kernels::intersect::{Frames, IntersectError};
 use splat_kernels::rasterize::{
-    RasterizeInputs, RasterizeSettings, RasterizeState, Sums, count_evaluations, rasterize,
-    rasterize_vjp,
+    RasterizeInputs, RasterizeSettings, RasterizeState, count_evaluations, rasterize, rasterize_vjp,
 };
 use splat_kernels::{Buffer, MOST_BUFFERS, bindable_buffers};
 
-use super::{buffer, prepare, tensor};
+use super::{buffer, gradients, prepare, tensor};
 use crate::OpError;
+use crate::backend::{
+    self, OpInputs, RasterizeBackend, RasterizeGradients, RasterizeOps, RasterizeTensors,
+};
 use crate::settings::RasterizeArgs;
-
-fn settings(settings: &crate::RasterizeSettings) -> RasterizeSettings {
-    RasterizeSettings {
-        alpha_max: settings.alpha_max as f32,
-        transmittance_min: settings.transmittance_min as f32,
-        sums: if settings.deterministic {
-            Sums::Ordered
-        } else {
-            Sums::Atomic
-        },
-    }
-}
 
 /// Sizes, from colours `[C, N, D]`.
 fn frames(colors: &CubeTensor, args: &RasterizeArgs) -> Frames {
@@ -41,53 +31,32 @@ fn frames(colors: &CubeTensor, args: &RasterizeArgs) -> Frames {
     }
 }
 
-/// Packed splats, colours, opacities and the background, ready for the kernels.
-struct Prepared {
-    packed: CubeTensor,
-    colors: CubeTensor,
-    opacities: CubeTensor,
-    background: Option<CubeTensor>,
-}
+/// The tensors of one call, ready for the kernels.
+type Prepared = RasterizeTensors<CubeTensor, Option<CubeTensor>>;
 
-impl Prepared {
-    fn new(
-        packed: CubeTensor,
-        colors: CubeTensor,
-        opacities: CubeTensor,
-        background: Option<CubeTensor>,
-    ) -> Self {
-        Self {
-            packed: prepare(packed),
-            colors: prepare(colors),
-            opacities: prepare(opacities),
-            background: background.map(prepare),
-        }
-    }
-
-    fn inputs(&self) -> RasterizeInputs {
-        RasterizeInputs {
-            packed: buffer(&self.packed),
-            colors: buffer(&self.colors),
-            opacities: buffer(&self.opacities),
-            background: self.background.as_ref().map(buffer),
-            channels: self.colors.shape()[2],
-        }
+fn inputs(tensors: &Prepared) -> RasterizeInputs {
+    RasterizeInputs {
+        packed: buffer(&tensors.packed),
+        colors: buffer(&tensors.colors),
+        opacities: buffer(&tensors.opacities),
+        background: tensors.background.as_ref().map(buffer),
+        channels: tensors.colors.shape()[2],
     }
 }
 
 fn op_error(error: IntersectError) -> OpError {
     let op = "rasterize";
     match error {
-        IntersectError::TooManyInstances { count, limit } => OpError::TooManyPairs {
+        IntersectError::TooManyIntersections { count, limit } => OpError::TooManyIntersections {
             op,
-            pairs: count,
+            intersections: count,
             limit,
         },
         IntersectError::Device(what) => OpError::Device { op, what },
     }
 }
 
-/// Of all kernels, those of the rasteriser's gradient bind the most. wgpu would refuse them when they are launched, which
+/// The rasteriser's gradient binds the most buffers. wgpu would refuse its kernels when they are launched, which
 /// shows when a gradient is read, if it is.
 fn enough_bindings(client: &Client) -> Result<(), OpError> {
     let (bound, needed) = (bindable_buffers(client), MOST_BUFFERS);
@@ -105,80 +74,70 @@ fn zeros(like: &CubeTensor, shape: Shape) -> CubeTensor {
     CubeBackend::float_zeros(shape, &like.device, FloatDType::F32)
 }
 
-/// The image with alpha `[C, H, W, D + 1]`, and what the backward pass needs. Where rendering fails, zeros and nothing,
-/// and the reason is in `args.errors`.
-pub(super) fn forward(
-    packed: CubeTensor,
-    colors: CubeTensor,
-    opacities: CubeTensor,
-    background: Option<CubeTensor>,
-    args: &RasterizeArgs,
-) -> (CubeTensor, Option<RasterizeState>) {
-    let prepared = Prepared::new(packed, colors, opacities, background);
-    let inputs = prepared.inputs();
-    let frames = frames(&prepared.colors, args);
-    let shape = Shape::from([
-        frames.cameras,
-        frames.height as usize,
-        frames.width as usize,
-        inputs.channels + 1,
-    ]);
-    let client = &prepared.packed.client;
-    let rendered = enough_bindings(client).and_then(|()| {
-        rasterize(client, &inputs, &frames, &settings(&args.settings)).map_err(op_error)
-    });
-    match rendered {
-        Ok((output, state)) => (tensor(&prepared.packed, output, shape), Some(state)),
-        Err(error) => {
-            args.errors.report(error);
-            (zeros(&prepared.packed, shape), None)
-        }
+impl RasterizeOps for CubeBackend {
+    fn rasterize(inputs: backend::RasterizeInputs<Self>, args: RasterizeArgs) -> CubeTensor {
+        Self::rasterize_tracked(inputs, &args).0
     }
 }
 
-/// The wanted gradients of packed splats, colours, opacities and background.
-pub(super) fn backward(
-    packed: CubeTensor,
-    colors: CubeTensor,
-    opacities: CubeTensor,
-    background: Option<CubeTensor>,
-    state: Option<&RasterizeState>,
-    grad_output: CubeTensor,
-    args: &RasterizeArgs,
-    wanted: [bool; 4],
-) -> [Option<CubeTensor>; 4] {
-    let prepared = Prepared::new(packed, colors, opacities, background);
-    let Some(state) = state else {
-        let [packed, colors, opacities] =
-            [&prepared.packed, &prepared.colors, &prepared.opacities].map(Some);
-        let inputs = [packed, colors, opacities, prepared.background.as_ref()];
-        return core::array::from_fn(|i| {
-            let input = inputs[i].filter(|_| wanted[i])?;
-            Some(zeros(input, input.shape()))
+impl RasterizeBackend for CubeBackend {
+    /// `None`: nothing was rendered, see [`RasterizeArgs::errors`].
+    type RasterizeState = Option<RasterizeState>;
+
+    fn rasterize_tracked(
+        OpInputs(tensors): backend::RasterizeInputs<Self>,
+        args: &RasterizeArgs,
+    ) -> (CubeTensor, Self::RasterizeState) {
+        let tensors = tensors.map_inputs(prepare);
+        let inputs = inputs(&tensors);
+        let frames = frames(&tensors.colors, args);
+        let shape = Shape::from([
+            frames.cameras,
+            frames.height as usize,
+            frames.width as usize,
+            inputs.channels + 1,
+        ]);
+        let client = &tensors.packed.client;
+        let rendered = enough_bindings(client).and_then(|()| {
+            let settings = RasterizeSettings::from(&args.settings);
+            rasterize(client, &inputs, &frames, &settings).map_err(op_error)
         });
-    };
-    let grad_output = prepare(grad_output);
-    let [packed, colors, opacities, background] = rasterize_vjp(
-        &grad_output.client,
-        &prepared.inputs(),
-        state,
-        &buffer(&grad_output),
-        &frames(&prepared.colors, args),
-        &settings(&args.settings),
-        wanted,
-    );
-    let like = |grad: Option<Buffer>, input: &CubeTensor| {
-        grad.map(|grad| tensor(input, grad, input.shape()))
-    };
-    [
-        like(packed, &prepared.packed),
-        like(colors, &prepared.colors),
-        like(opacities, &prepared.opacities),
-        prepared
-            .background
-            .as_ref()
-            .and_then(|input| like(background, input)),
-    ]
+        match rendered {
+            Ok((output, state)) => (tensor(&tensors.packed, output, shape), Some(state)),
+            Err(error) => {
+                args.errors.report(error);
+                (zeros(&tensors.packed, shape), None)
+            }
+        }
+    }
+
+    fn rasterize_backward(
+        OpInputs(tensors): backend::RasterizeInputs<Self>,
+        state: Self::RasterizeState,
+        grad_output: CubeTensor,
+        args: &RasterizeArgs,
+        needs_grad: RasterizeTensors<bool>,
+    ) -> RasterizeGradients<Self> {
+        let tensors = tensors.map_inputs(prepare);
+        let Some(state) = state else {
+            let inputs = needs_grad.zip(tensors.inputs());
+            return inputs.map(|(needed, input)| {
+                let input = input.filter(|_| needed)?;
+                Some(zeros(input, input.shape()))
+            });
+        };
+        let grad_output = prepare(grad_output);
+        let grads = rasterize_vjp(
+            &grad_output.client,
+            &inputs(&tensors),
+            &state,
+            &buffer(&grad_output),
+            &frames(&tensors.colors, args),
+            &RasterizeSettings::from(&args.settings),
+            needs_grad,
+        );
+        gradients(grads.into(), tensors.inputs().into()).into()
+    }
 }
 
 /// The evaluations of a forward pass, counted on the device of `client`. Through the host: packed splats, colours
@@ -211,12 +170,12 @@ pub(crate) fn work(
         height: size.height,
         alpha_min: settings.alpha_min as f32,
     };
-    let settings = self::settings(settings);
+    let settings = RasterizeSettings::from(settings);
     let (_, state) = rasterize(client, &inputs, &frames, &settings).map_err(op_error)?;
     let count = count_evaluations(client, &inputs, &state, &frames, &settings);
     let count = count.map_err(|what| op_error(IntersectError::Device(what)))?;
     Ok(crate::RasterizeWork {
-        instances: state.lists.instances as u64,
+        intersections: state.lists.intersections as u64,
         tested: count.tested,
         seen: count.seen,
         blended: count.blended,

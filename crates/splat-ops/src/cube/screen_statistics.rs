@@ -1,20 +1,38 @@
 //! Sums of screen gradients and of views on CubeCL devices.
 
-use burn_cubecl::tensor::CubeTensor;
+use burn_cubecl::CubeBackend;
 use splat_kernels::screen_statistics::screen_statistics;
 
 use super::{buffer, prepare, taken};
+use crate::backend::{
+    OpInputs, ScreenProbeOps, ScreenStatisticsInputs, ScreenStatisticsOps, ScreenStatisticsOutputs,
+    ScreenStatisticsTensors,
+};
 
-/// Gradient and splats `[C, N, 9]` and both sums `[N]` to the sums with this step added.
-pub(super) fn add(tensors: [CubeTensor; 4], half: [f64; 2]) -> [CubeTensor; 2] {
-    let [gradient, packed, lengths, views] = tensors.map(prepare);
-    let (lengths, lengths_tensor) = taken(lengths);
-    let (views, views_tensor) = taken(views);
-    let [lengths, views] = screen_statistics(
-        &gradient.client,
-        [&buffer(&gradient), &buffer(&packed)],
-        [lengths, views],
-        half.map(|half| half as f32),
-    );
-    [lengths_tensor(lengths), views_tensor(views)]
+impl ScreenProbeOps for CubeBackend {}
+
+impl ScreenStatisticsOps for CubeBackend {
+    fn add_screen_statistics(
+        OpInputs(inputs): ScreenStatisticsInputs<Self>,
+        half: [f64; 2],
+    ) -> ScreenStatisticsOutputs<Self> {
+        let ScreenStatisticsTensors {
+            gradient,
+            packed,
+            gradients,
+            views,
+        } = inputs.map(prepare);
+        let (gradients, gradients_tensor) = taken(gradients);
+        let (views, views_tensor) = taken(views);
+        let [gradients, views] = screen_statistics(
+            &gradient.client,
+            [&buffer(&gradient), &buffer(&packed)],
+            [gradients, views],
+            half.map(|half| half as f32),
+        );
+        ScreenStatisticsOutputs {
+            gradients: gradients_tensor(gradients),
+            views: views_tensor(views),
+        }
+    }
 }

@@ -8,83 +8,71 @@ use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::HalfBuffer;
 use splat_kernels::sh_colors as kernels;
 
-use super::{buffer, prepare, tensor};
-use crate::backend::ShInputs;
-use crate::settings::{ClampGradient, ShColorSettings};
+use super::{buffer, gradients, prepare, tensor};
+use crate::backend::{
+    OpInputs, ShColorGradients, ShColorInputs, ShColorTensors, ShColorsBackend, ShColorsOps,
+};
+use crate::settings::ShColorSettings;
 
-/// The inputs, ready for the kernels.
-struct Prepared {
-    sh0: CubeTensor,
-    sh_rest: Option<CubeTensor>,
-    means: CubeTensor,
-    centers: CubeTensor,
-    seen: Option<CubeTensor>,
-}
-
-impl Prepared {
-    fn new(inputs: ShInputs<CubeBackend>) -> Self {
-        Self {
-            sh0: prepare(inputs.sh0),
-            // The kernels read both of the types that the op takes.
-            sh_rest: inputs.sh_rest.map(into_contiguous),
-            means: prepare(inputs.means),
-            centers: prepare(inputs.centers),
-            seen: inputs.seen.map(prepare),
-        }
-    }
-
-    fn buffers(&self) -> kernels::ShInputs {
-        kernels::ShInputs {
-            sh0: buffer(&self.sh0),
-            sh_rest: self.sh_rest.as_ref().map(|rest| match rest.dtype {
-                DType::F16 => {
-                    let len = rest.shape().num_elements();
-                    HalfBuffer::new(rest.handle.clone(), len).map_or_else(
-                        |_| kernels::ShRest::Exact(buffer(rest)),
-                        kernels::ShRest::Half,
-                    )
-                }
-                _ => kernels::ShRest::Exact(buffer(rest)),
-            }),
-            stored: self.sh_rest.as_ref().map_or(0, |rest| rest.shape()[1]),
-            means: buffer(&self.means),
-            centers: buffer(&self.centers),
-            seen: self.seen.as_ref().map(buffer),
-        }
+/// The inputs, ready for the kernels, which read the higher coefficients in both of the types that the op takes.
+fn prepared(
+    inputs: ShColorTensors<CubeTensor, Option<CubeTensor>>,
+) -> ShColorTensors<CubeTensor, Option<CubeTensor>> {
+    ShColorTensors {
+        sh0: prepare(inputs.sh0),
+        sh_rest: inputs.sh_rest.map(into_contiguous),
+        means: prepare(inputs.means),
+        centers: prepare(inputs.centers),
+        seen: inputs.seen.map(prepare),
     }
 }
 
-/// Colours `[C, N, 3]`.
-pub(super) fn forward(inputs: ShInputs<CubeBackend>, settings: ShColorSettings) -> CubeTensor {
-    let inputs = Prepared::new(inputs);
-    let (means, centers) = (&inputs.means, &inputs.centers);
-    let colors = kernels::sh_colors(&means.client, &inputs.buffers(), settings.degree);
-    let shape = [centers.shape()[0], means.shape()[0], 3];
-    tensor(means, colors, Shape::from(shape))
+fn buffers(inputs: &ShColorTensors<CubeTensor, Option<CubeTensor>>) -> kernels::ShColorInputs {
+    kernels::ShColorInputs {
+        sh0: buffer(&inputs.sh0),
+        sh_rest: inputs.sh_rest.as_ref().map(|rest| match rest.dtype {
+            DType::F16 => {
+                let len = rest.shape().num_elements();
+                HalfBuffer::new(rest.handle.clone(), len).map_or_else(
+                    |_| kernels::ShRest::Exact(buffer(rest)),
+                    kernels::ShRest::Half,
+                )
+            }
+            _ => kernels::ShRest::Exact(buffer(rest)),
+        }),
+        stored: inputs.sh_rest.as_ref().map_or(0, |rest| rest.shape()[1]),
+        means: buffer(&inputs.means),
+        centers: buffer(&inputs.centers),
+        seen: inputs.seen.as_ref().map(buffer),
+    }
 }
 
-/// The wanted gradients of the four inputs.
-pub(super) fn backward(
-    inputs: ShInputs<CubeBackend>,
-    grad: CubeTensor,
-    settings: ShColorSettings,
-    wanted: [bool; 4],
-) -> [Option<CubeTensor>; 4] {
-    let inputs = Prepared::new(inputs);
-    let grad = prepare(grad);
-    let [sh0, sh_rest, means, centers] = kernels::sh_colors_backward(
-        &grad.client,
-        &inputs.buffers(),
-        &buffer(&grad),
-        settings.degree,
-        settings.clamp_gradient == ClampGradient::Recovering,
-        wanted,
-    );
-    let like = |grad: Option<_>, input: &CubeTensor| Some(tensor(input, grad?, input.shape()));
-    [
-        like(sh0, &inputs.sh0),
-        inputs.sh_rest.as_ref().and_then(|rest| like(sh_rest, rest)),
-        like(means, &inputs.means),
-        like(centers, &inputs.centers),
-    ]
+impl ShColorsOps for CubeBackend {
+    fn sh_colors(OpInputs(inputs): ShColorInputs<Self>, settings: ShColorSettings) -> CubeTensor {
+        let inputs = prepared(inputs);
+        let (means, centers) = (&inputs.means, &inputs.centers);
+        let colors = kernels::sh_colors(&means.client, &buffers(&inputs), settings);
+        let shape = [centers.shape()[0], means.shape()[0], 3];
+        tensor(means, colors, Shape::from(shape))
+    }
+}
+
+impl ShColorsBackend for CubeBackend {
+    fn sh_colors_backward(
+        OpInputs(inputs): ShColorInputs<Self>,
+        grad_colors: CubeTensor,
+        settings: ShColorSettings,
+        needs_grad: ShColorTensors<bool>,
+    ) -> ShColorGradients<Self> {
+        let inputs = prepared(inputs);
+        let grad_colors = prepare(grad_colors);
+        let grads = kernels::sh_colors_backward(
+            &grad_colors.client,
+            &buffers(&inputs),
+            &buffer(&grad_colors),
+            settings,
+            needs_grad,
+        );
+        gradients(grads.into(), inputs.inputs().into()).into()
+    }
 }

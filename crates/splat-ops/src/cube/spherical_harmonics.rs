@@ -1,46 +1,51 @@
 //! Spherical harmonics on CubeCL devices.
 
 use burn::backend::TensorMetadata;
+use burn_cubecl::CubeBackend;
 use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::sh;
 
-use super::{buffer, prepare, tensor};
+use super::{buffer, gradients, prepare, tensor};
+use crate::backend::{
+    OpInputs, SphericalHarmonicsBackend, SphericalHarmonicsGradients, SphericalHarmonicsInputs,
+    SphericalHarmonicsOps, SphericalHarmonicsTensors,
+};
 
-/// Colours `[C, N, 3]`.
-pub(super) fn forward(coeffs: CubeTensor, dirs: CubeTensor, degree: usize) -> CubeTensor {
-    let (coeffs, dirs) = (prepare(coeffs), prepare(dirs));
-    let stored = coeffs.shape()[1];
-    let colors = sh::evaluate(
-        &dirs.client,
-        &buffer(&coeffs),
-        &buffer(&dirs),
-        stored,
-        degree,
-    );
-    tensor(&dirs, colors, dirs.shape())
+impl SphericalHarmonicsOps for CubeBackend {
+    fn spherical_harmonics(
+        OpInputs(inputs): SphericalHarmonicsInputs<Self>,
+        degree: usize,
+    ) -> CubeTensor {
+        let SphericalHarmonicsTensors { coeffs, dirs } = inputs.map(prepare);
+        let colors = sh::evaluate(
+            &dirs.client,
+            &buffer(&coeffs),
+            &buffer(&dirs),
+            coeffs.shape()[1],
+            degree,
+        );
+        tensor(&dirs, colors, dirs.shape())
+    }
 }
 
-/// The wanted gradients of coefficients and directions.
-pub(super) fn backward(
-    coeffs: CubeTensor,
-    dirs: CubeTensor,
-    grad: CubeTensor,
-    degree: usize,
-    wanted: [bool; 2],
-) -> [Option<CubeTensor>; 2] {
-    let (coeffs, dirs, grad) = (prepare(coeffs), prepare(dirs), prepare(grad));
-    let stored = coeffs.shape()[1];
-    let [grad_coeffs, grad_dirs] = sh::evaluate_backward(
-        &dirs.client,
-        &buffer(&coeffs),
-        &buffer(&dirs),
-        &buffer(&grad),
-        stored,
-        degree,
-        wanted,
-    );
-    [
-        grad_coeffs.map(|grad| tensor(&coeffs, grad, coeffs.shape())),
-        grad_dirs.map(|grad| tensor(&dirs, grad, dirs.shape())),
-    ]
+impl SphericalHarmonicsBackend for CubeBackend {
+    fn spherical_harmonics_backward(
+        OpInputs(inputs): SphericalHarmonicsInputs<Self>,
+        grad_colors: CubeTensor,
+        degree: usize,
+        needs_grad: SphericalHarmonicsTensors<bool>,
+    ) -> SphericalHarmonicsGradients<Self> {
+        let inputs = inputs.map(prepare);
+        let SphericalHarmonicsTensors { coeffs, dirs } = &inputs;
+        let grads = sh::evaluate_backward(
+            &dirs.client,
+            &buffer(coeffs),
+            &buffer(dirs),
+            &buffer(&prepare(grad_colors)),
+            coeffs.shape()[1],
+            degree,
+            needs_grad.into(),
+        );
+        gradients(grads, inputs.inputs().into()).into()
+    }
 }

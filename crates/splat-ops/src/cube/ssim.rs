@@ -2,11 +2,13 @@
 
 use burn::backend::TensorMetadata;
 use burn::tensor::Shape;
+use burn_cubecl::CubeBackend;
 use burn_cubecl::tensor::CubeTensor;
 use splat_kernels::ssim::{SsimShape, ssim, ssim_vjp};
 
-use super::{buffer, prepare, tensor};
-use crate::ssim::SsimArgs;
+use super::{buffer, gradients, prepare, tensor};
+use crate::backend::{OpInputs, SsimBackend, SsimGradients, SsimInputs, SsimOps, SsimTensors};
+use crate::settings::SsimArgs;
 
 fn shape(image: &CubeTensor, args: &SsimArgs) -> SsimShape {
     let shape = image.shape();
@@ -24,35 +26,44 @@ fn window(args: &SsimArgs) -> Vec<f32> {
     args.window.iter().map(|weight| *weight as f32).collect()
 }
 
-/// The map `[B, H, W, D]`, and one tensor for the gradient: the windowed means `[4, B, H, W, D]`.
-pub(super) fn forward(images: [CubeTensor; 2], args: &SsimArgs) -> (CubeTensor, Vec<CubeTensor>) {
-    let [x, y] = images.map(prepare);
-    let sizes = shape(&x, args);
-    let (map, moments) = ssim(&x.client, [&buffer(&x), &buffer(&y)], &sizes, &window(args));
-    let kept = Shape::from([4, sizes.images, sizes.height, sizes.width, sizes.channels]);
-    let map = tensor(&x, map, x.shape());
-    (map, vec![tensor(&x, moments, kept)])
+impl SsimOps for CubeBackend {
+    fn ssim(inputs: SsimInputs<Self>, args: SsimArgs) -> CubeTensor {
+        Self::ssim_tracked(inputs, &args).0
+    }
 }
 
-/// The wanted gradients of both images.
-pub(super) fn backward(
-    images: [CubeTensor; 2],
-    moments: Vec<CubeTensor>,
-    grad: CubeTensor,
-    args: &SsimArgs,
-    wanted: [bool; 2],
-) -> [Option<CubeTensor>; 2] {
-    let [x, y] = images.map(prepare);
-    let grad = prepare(grad);
-    // The forward keeps one tensor.
-    let grads = ssim_vjp(
-        &x.client,
-        [&buffer(&x), &buffer(&y)],
-        &buffer(&moments[0]),
-        &buffer(&grad),
-        &shape(&x, args),
-        &window(args),
-        wanted,
-    );
-    grads.map(|grad| grad.map(|grad| tensor(&x, grad, x.shape())))
+impl SsimBackend for CubeBackend {
+    /// Keeps one tensor: the windowed means `[4, B, H, W, D]`.
+    fn ssim_tracked(
+        OpInputs(inputs): SsimInputs<Self>,
+        args: &SsimArgs,
+    ) -> (CubeTensor, Vec<CubeTensor>) {
+        let SsimTensors { x, y } = inputs.map(prepare);
+        let sizes = shape(&x, args);
+        let (map, moments) = ssim(&x.client, [&buffer(&x), &buffer(&y)], &sizes, &window(args));
+        let kept = Shape::from([4, sizes.images, sizes.height, sizes.width, sizes.channels]);
+        let map = tensor(&x, map, x.shape());
+        (map, vec![tensor(&x, moments, kept)])
+    }
+
+    fn ssim_backward(
+        OpInputs(inputs): SsimInputs<Self>,
+        moments: Vec<CubeTensor>,
+        grad_map: CubeTensor,
+        args: &SsimArgs,
+        needs_grad: SsimTensors<bool>,
+    ) -> SsimGradients<Self> {
+        let inputs = inputs.map(prepare);
+        let SsimTensors { x, y } = &inputs;
+        let grads = ssim_vjp(
+            &x.client,
+            [&buffer(x), &buffer(y)],
+            &buffer(&moments[0]),
+            &buffer(&prepare(grad_map)),
+            &shape(x, args),
+            &window(args),
+            needs_grad.into(),
+        );
+        gradients(grads, inputs.inputs().into()).into()
+    }
 }

@@ -126,25 +126,28 @@ impl Scene {
             &device,
         );
         let grads = (image.clone() * weights).sum().backward();
-        let host = |data: TensorData| data.try_to_vec::<f32>().unwrap();
+        let to_host = |data: TensorData| data.try_to_vec::<f32>().unwrap();
         vec![
-            ("image", host(image.into_data())),
-            ("means", host(means.grad(&grads).unwrap().into_data())),
-            ("quats", host(quats.grad(&grads).unwrap().into_data())),
-            ("scales", host(scales.grad(&grads).unwrap().into_data())),
-            ("viewmats", host(viewmats.grad(&grads).unwrap().into_data())),
+            ("image", to_host(image.into_data())),
+            ("means", to_host(means.grad(&grads).unwrap().into_data())),
+            ("quats", to_host(quats.grad(&grads).unwrap().into_data())),
+            ("scales", to_host(scales.grad(&grads).unwrap().into_data())),
+            (
+                "viewmats",
+                to_host(viewmats.grad(&grads).unwrap().into_data()),
+            ),
             (
                 "intrinsics",
-                host(intrinsics.grad(&grads).unwrap().into_data()),
+                to_host(intrinsics.grad(&grads).unwrap().into_data()),
             ),
-            ("coeffs", host(coeffs.grad(&grads).unwrap().into_data())),
+            ("coeffs", to_host(coeffs.grad(&grads).unwrap().into_data())),
             (
                 "opacities",
-                host(opacities.grad(&grads).unwrap().into_data()),
+                to_host(opacities.grad(&grads).unwrap().into_data()),
             ),
             (
                 "background",
-                host(background.grad(&grads).unwrap().into_data()),
+                to_host(background.grad(&grads).unwrap().into_data()),
             ),
         ]
     }
@@ -350,7 +353,7 @@ fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
     if !has_adapter() {
         return;
     }
-    // 12,000 splats over each of 4096 x 4 tiles: more than the 195 million pairs that can be listed.
+    // 12,000 splats over each of 4096 x 4 tiles: more than the 195 million intersections that can be listed.
     let n = 12_000;
     let size = ImageSize {
         width: 65_536,
@@ -376,9 +379,9 @@ fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
     let settings = RasterizeSettings::default();
     let error = rasterize(&projected, colors, opacities, None, &settings).unwrap_err();
     println!("{error}");
-    let pairs = n as u64 * 4096 * 4;
+    let intersections = n as u64 * 4096 * 4;
     assert!(
-        matches!(error, OpError::TooManyPairs { pairs: found, .. } if found == pairs),
+        matches!(error, OpError::TooManyIntersections { intersections: found, .. } if found == intersections),
         "{error:?}"
     );
 }

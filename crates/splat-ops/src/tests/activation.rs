@@ -13,10 +13,10 @@ fn activations_and_their_gradients_keep_their_digits() {
     for (name, device) in devices() {
         let device = device.autodiff();
         let x = Tensor::<1>::from_data(TensorData::from(at), &device).require_grad();
-        let host = |x: Tensor<1>| x.into_data().try_into_vec::<f32>().unwrap();
+        let to_host = |x: Tensor<1>| x.into_data().try_into_vec::<f32>().unwrap();
         let value_and_gradient = |y: Tensor<1>| {
             let gradient = x.grad(&y.clone().sum().backward()).unwrap();
-            (host(y), host(gradient))
+            (to_host(y), to_host(gradient))
         };
         let (opacities, slopes) = value_and_gradient(sigmoid(x.clone()));
         let (scales, same) = value_and_gradient(exp(x.clone()));

@@ -66,11 +66,11 @@ fn render(
     let weights = at(weights.to_vec(), [CAMERAS, PIXELS, 1]);
     let loss = (image.clone().reshape([CAMERAS, PIXELS, 1]) * weights).sum();
     let grads = loss.backward();
-    let host = |data: TensorData| data.try_to_vec::<f32>().unwrap();
+    let to_host = |data: TensorData| data.try_to_vec::<f32>().unwrap();
     Outcome {
-        image: host(image.into_data()),
-        colors: host(colors.grad(&grads).unwrap().into_data()),
-        opacities: host(opacities.grad(&grads).unwrap().into_data()),
+        image: to_host(image.into_data()),
+        colors: to_host(colors.grad(&grads).unwrap().into_data()),
+        opacities: to_host(opacities.grad(&grads).unwrap().into_data()),
     }
 }
 

@@ -1,4 +1,4 @@
-//! What must hold on every backend: the native path, and the kernels where there is an adapter.
+//! Promises of every backend: the native path, and the kernels where there is an adapter.
 
 mod activation;
 mod decisions;

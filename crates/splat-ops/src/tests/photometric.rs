@@ -18,7 +18,7 @@ const SHAPES: [[usize; 5]; 8] = [
     [1, 60, 5, 3, 4],
     [1, 1, 1, 3, 4],
 ];
-/// Of L1 and SSIM in the loss.
+/// Weights of L1 and SSIM in the loss.
 const WEIGHTS: [f64; 2] = [0.7, -1.3];
 
 fn args() -> SsimArgs {

@@ -23,9 +23,9 @@ struct Scene {
     gaussians: usize,
     channels: usize,
     size: ImageSize,
-    /// Of the splats; large ones stop pixels before the end of their lists.
+    /// Opacities of the splats; large ones stop pixels before the end of their lists.
     scale: f32,
-    /// Of the rasteriser's gradients.
+    /// Settings of the rasteriser's gradients.
     deterministic: bool,
 }
 

@@ -18,12 +18,16 @@ fn a_probe_gets_the_gradient_of_the_splats() {
         };
         let projected = Projected::from_packed(packed.clone() * 2.0, size).unwrap();
         let (probed, probe) = projected.clone().with_screen_probe();
-        let host = |x: Tensor<3>| x.into_data().try_into_vec::<f32>().unwrap();
-        assert_eq!(host(probed.packed()), host(projected.packed()), "{name}");
+        let to_host = |x: Tensor<3>| x.into_data().try_into_vec::<f32>().unwrap();
+        assert_eq!(
+            to_host(probed.packed()),
+            to_host(projected.packed()),
+            "{name}"
+        );
 
         let grads = (probed.packed() * packed.clone().detach()).sum().backward();
-        let of_probe = host(probe.grad(&grads).unwrap());
-        let of_packed = host(packed.grad(&grads).unwrap());
+        let of_probe = to_host(probe.grad(&grads).unwrap());
+        let of_packed = to_host(packed.grad(&grads).unwrap());
         let expected: Vec<f32> = (0..2 * 5 * 9).map(|i| i as f32).collect();
         assert_eq!(of_probe, expected, "{name}");
         let expected: Vec<f32> = (0..2 * 5 * 9).map(|i| 2.0 * i as f32).collect();

@@ -1,4 +1,4 @@
-//! Gradients of a projection do not depend on which others are asked for.
+//! Gradients of a projection do not depend on which others are asked for; splats on the border are culled.
 
 use burn::tensor::{Device, Tensor, TensorData};
 
@@ -75,6 +75,62 @@ fn a_gradient_alone_is_the_same_as_with_all_others() {
             let expected = all[i].as_ref().unwrap();
             assert!(expected.iter().any(|g| *g != 0.0), "{name}: {i}");
             assert_eq!(alone[i].as_ref(), Some(expected), "{name}: {i}");
+        }
+    }
+}
+
+/// The packed row of a Gaussian on the axis of a camera with the principal point (cx, cy), so that its mean lies there.
+fn on_axis(device: &Device, size: ImageSize, [cx, cy]: [f32; 2]) -> [f32; 9] {
+    let at = |values: Vec<f32>| {
+        let width = values.len();
+        Tensor::<2>::from_data(TensorData::new(values, [1, width]), device)
+    };
+    let mut viewmat = [0.0; 16];
+    for i in 0..4 {
+        viewmat[5 * i] = 1.0;
+    }
+    // The Jacobian is that at the mean, wherever the image is.
+    let settings = ProjectSettings {
+        clamp_margin: 10.0,
+        ..Default::default()
+    };
+    let projected = project(
+        at(vec![0.0, 0.0, 2.0]),
+        at(vec![1.0, 0.2, 0.1, 0.3]),
+        at(vec![0.1, 0.2, 0.15]),
+        at(viewmat.to_vec()).reshape([1, 4, 4]),
+        at(vec![40.0, 42.0, cx, cy]),
+        size,
+        &settings,
+    );
+    let row = projected.unwrap().packed().into_data();
+    row.try_into_vec::<f32>().unwrap().try_into().unwrap()
+}
+
+#[test]
+fn a_splat_whose_box_only_touches_the_border_is_culled() {
+    // So large that a border plus an extent, less the extent, is the border: both sums have as fine digits.
+    let size = ImageSize {
+        width: 40,
+        height: 40,
+    };
+    let (width, height) = (size.width as f32, size.height as f32);
+    for (name, device) in devices() {
+        let middle = on_axis(&device, size, [20.0, 20.0]);
+        let [.., x, y] = middle;
+        let extents = |[cx, cy]: [f32; 2]| on_axis(&device, size, [cx, cy])[7..].to_vec();
+        assert!(x > 1.0 && y > 1.0, "{name}: {middle:?}");
+        let (right, below) = (width + x, height + y);
+        assert_eq!(
+            [right - x, below - y],
+            [width, height],
+            "{name}: {middle:?}"
+        );
+        for [cx, cy] in [[-x, 20.0], [right, 20.0], [20.0, -y], [20.0, below]] {
+            assert_eq!(extents([cx, cy]), [0.0, 0.0], "{name}: at {cx}, {cy}");
+            let nudged = |at: f32, middle: f32| at + (middle - at) * 1e-4;
+            let inside = [nudged(cx, 20.0), nudged(cy, 20.0)];
+            assert_eq!(extents(inside), [x, y], "{name}: at {inside:?}");
         }
     }
 }

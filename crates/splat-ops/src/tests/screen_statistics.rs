@@ -29,9 +29,9 @@ fn lengths_in_half_images_are_summed_where_seen_and_finite() {
             views: start,
         };
         let sums = sums.add(tensor, &projected).unwrap();
-        let host = |x: Tensor<1>| x.into_data().try_into_vec::<f32>().unwrap();
-        assert_eq!(host(held), [1.0, 2.0, 3.0, 4.0, 5.0], "{name}");
-        let (gradients, views) = (host(sums.gradients), host(sums.views));
+        let to_host = |x: Tensor<1>| x.into_data().try_into_vec::<f32>().unwrap();
+        assert_eq!(to_host(held), [1.0, 2.0, 3.0, 4.0, 5.0], "{name}");
+        let (gradients, views) = (to_host(sums.gradients), to_host(sums.views));
         for n in 0..5 {
             let (mut length, mut count) = (n as f32 + 1.0, n as f32 + 1.0);
             for row in [n, 5 + n].map(|row| &values[9 * row..9 * row + 9]) {

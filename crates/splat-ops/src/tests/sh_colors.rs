@@ -33,7 +33,7 @@ impl Leaves {
             means[..3].copy_from_slice(&centers[..3]);
             sh0[3..6].fill(-9.0);
             sh_rest[2 * 45..3 * 45].fill(f64::NAN);
-            // Of a dark one a channel is exactly on the clamp at any degree.
+            // A dark one has a channel exactly on the clamp at any degree.
             sh0[3 * 4] = -0.5 / 0.282_094_791_773_878_14;
             for k in 0..15 {
                 sh_rest[4 * 45 + 3 * k] = 0.0;
@@ -96,13 +96,19 @@ impl Leaves {
         weights: Tensor<3>,
     ) -> Vec<(&'static str, Vec<f64>)> {
         let grads = (colors.clone() * weights).sum().backward();
-        let host = |data: TensorData| data.convert::<f64>().try_into_vec::<f64>().unwrap();
-        let mut found = vec![("colors", host(colors.into_data()))];
+        let to_host = |data: TensorData| data.convert::<f64>().try_into_vec::<f64>().unwrap();
+        let mut found = vec![("colors", to_host(colors.into_data()))];
         for (name, leaf) in [("sh0", &self.sh0), ("sh_rest", &self.sh_rest)] {
-            found.extend(leaf.grad(&grads).map(|grad| (name, host(grad.into_data()))));
+            found.extend(
+                leaf.grad(&grads)
+                    .map(|grad| (name, to_host(grad.into_data()))),
+            );
         }
         for (name, leaf) in [("means", &self.means), ("centers", &self.centers)] {
-            found.extend(leaf.grad(&grads).map(|grad| (name, host(grad.into_data()))));
+            found.extend(
+                leaf.grad(&grads)
+                    .map(|grad| (name, to_host(grad.into_data()))),
+            );
         }
         found
     }
@@ -202,7 +208,7 @@ fn what_a_camera_culled_is_black_and_gets_no_gradient() {
 /// not clamped both are the same.
 #[test]
 fn a_channel_below_zero_can_recover_if_asked_to() {
-    const Y0: f32 = 0.282_094_8;
+    const Y0: f32 = splat_core::SH_C0 as f32;
     let below = -2.0f32;
     for (name, device) in devices() {
         let device = device.autodiff();

@@ -3,10 +3,10 @@
 //! Splats are worked on side by side, as SIMD code. What depends on a splat, how many rows of tiles it reaches and how many
 //! tiles in each, is no branch wherever it can be avoided: it would be guessed wrongly as often as not.
 
-use super::super::rasterize::{GROUP, NUMBERS, Splat};
 use super::super::real::Real;
 use super::super::simd::{LANES, Lanes, vectorized};
-use super::{Grid, TILE};
+use super::super::splat::{GROUP, NUMBERS, Splat};
+use super::super::tiles::{Grid, TILE};
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::RasterizeArgs;
 
@@ -16,7 +16,7 @@ const ROWS: usize = 4;
 /// Tiles of a row that are written at once, whether a splat reaches as many or not.
 const RUN: usize = 4;
 
-/// What is the same for all splats of a view.
+/// Inputs and settings that all splats of a view share.
 pub(super) struct Emission<'a, T> {
     packed: &'a [T],
     colors: &'a [T],
@@ -33,7 +33,7 @@ pub(super) struct Emitted {
     /// Where each splat's end.
     pub(super) ends: Vec<u32>,
     /// How many they are, kept or not.
-    pub(super) pairs: u64,
+    pub(super) intersections: u64,
 }
 
 impl<'a, T: Real> Emission<'a, T> {
@@ -65,7 +65,7 @@ vectorized! {
         let mut emitted = Emitted {
             tiles: Vec::with_capacity(4 * listed.len()),
             ends: Vec::with_capacity(listed.len()),
-            pairs: 0,
+            intersections: 0,
         };
         let mut block = Block::new();
         let outputs = splats.chunks_mut(LANES).zip(depths.chunks_mut(LANES));
@@ -77,7 +77,7 @@ vectorized! {
             }
             let before = emitted.tiles.len();
             block.emit(emission.grid, splats, &mut emitted);
-            emitted.pairs += (emitted.tiles.len() - before) as u64;
+            emitted.intersections += (emitted.tiles.len() - before) as u64;
             if !emission.keeps {
                 emitted.tiles.clear();
             }
@@ -88,7 +88,7 @@ vectorized! {
 
 /// Splats side by side.
 struct Block<T> {
-    /// Of a packed splat the mean and the inverse Cholesky factor, and the opacity.
+    /// Mean and inverse Cholesky factor of a packed splat, and the opacity.
     given: [Lanes<T>; 6],
     /// The splats, number by number.
     splats: [Lanes<T>; NUMBERS],
@@ -282,9 +282,16 @@ mod tests {
             emit(&emission, &listed, &mut splats, &mut depths)
         };
         let counted = emitted(false);
-        let Emitted { tiles, ends, pairs } = emitted(true);
-        assert_eq!((counted.pairs, counted.tiles.len()), (pairs, 0));
-        assert_eq!(pairs, tiles.len() as u64);
+        let Emitted {
+            tiles,
+            ends,
+            intersections,
+        } = emitted(true);
+        assert_eq!(
+            (counted.intersections, counted.tiles.len()),
+            (intersections, 0)
+        );
+        assert_eq!(intersections, tiles.len() as u64);
         assert_eq!(ends.len(), listed.len());
         assert!(depths.iter().all(|depth| *depth == 1.0));
         for (splat, color) in splats.iter().zip(colors.as_chunks::<2>().0) {
@@ -309,7 +316,7 @@ mod tests {
                     let (dx, dy) = (x as f64 + 0.5 - wide[0], y as f64 + 0.5 - wide[1]);
                     let (z1, z2) = (wide[3] * dx, wide[4] * dx + wide[5] * dy);
                     let alpha = f64::from(*opacity) * (-(z1 * z1 + z2 * z2) / 2.0).exp();
-                    if alpha >= 1.0 / 255.0 {
+                    if alpha >= splat_core::ALPHA_MIN {
                         visible[y / TILE * grid.columns + x / TILE] = true;
                     }
                 }

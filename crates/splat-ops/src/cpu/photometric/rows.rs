@@ -1,4 +1,4 @@
-//! What is done to rows, in blocks of [`LANES`] values. Rows are [`padded`]: the last block of a range may reach over its
+//! Arithmetic on rows, in blocks of [`LANES`] values. Rows are [`padded`]: the last block of a range may reach over its
 //! end, where nothing is read that matters.
 
 use core::ops::Range;

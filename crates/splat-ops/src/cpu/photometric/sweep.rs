@@ -19,7 +19,8 @@ use super::pictures::{Pictures, Rows};
 use super::rows;
 use crate::cpu::buffer::overwritten;
 use crate::cpu::real::Real;
-use crate::ssim::{SsimArgs, counted};
+use crate::settings::SsimArgs;
+use crate::ssim::counted;
 
 /// Most pixels of a strip: its rings stay in a core's second-level cache.
 const STRIP: usize = 320;
@@ -28,7 +29,7 @@ pub(super) const MOMENTS: usize = 4;
 /// Derivatives by mx, q, p, all but the second halved.
 pub(super) const FIELDS: usize = 3;
 
-/// What is the same for all bands.
+/// Inputs and settings that all bands share.
 pub(super) struct Sweep<'a, T> {
     rows: Rows<'a, T>,
     height: usize,

@@ -2,18 +2,15 @@
 
 use super::super::math::*;
 use super::super::real::Real;
-use super::splat::{Camera, Gaussian, Splat};
+use super::camera::{Camera, CameraGradient};
+use super::splat::{Gaussian, Splat};
 
 /// Gradients of one (camera, Gaussian) pair.
 pub(super) struct Gradient<T> {
-    pub(super) mean: Vec3<T>,
+    /// Gradients of the camera and of the mean.
+    pub(super) camera: CameraGradient<T>,
     pub(super) quat: [T; 4],
     pub(super) scale: Vec3<T>,
-    /// Of the camera's W and t.
-    pub(super) w: Mat3<T>,
-    pub(super) t: Vec3<T>,
-    /// Of fx, fy, cx, cy.
-    pub(super) intrinsics: [T; 4],
 }
 
 /// Given the gradient of the first seven columns of [`Splat::packed`]; the extents carry none.
@@ -58,60 +55,16 @@ pub(super) fn splat_backward<T: Real>(
     // V = (J W R) diag(s) -> scales, R, J W.
     let dscale = add(hadamard(dv1, s.jwr[0]), hadamard(dv2, s.jwr[1]));
     let djwr = [hadamard(dv1, g.scale), hadamard(dv2, g.scale)];
-    let drotation = add3(&outer(s.jw[0], djwr[0]), &outer(s.jw[1], djwr[1]));
+    let drotation = add3(
+        &outer(s.sight.jw[0], djwr[0]),
+        &outer(s.sight.jw[1], djwr[1]),
+    );
     let djw = [apply(&s.rotation, djwr[0]), apply(&s.rotation, djwr[1])];
 
-    // J W -> J, W.
-    let [_, _, z] = s.p;
-    let (fx, fy) = (camera.fx, camera.fy);
-    let dj11 = dot(djw[0], camera.w[0]);
-    let dj13 = dot(djw[0], camera.w[2]);
-    let dj22 = dot(djw[1], camera.w[1]);
-    let dj23 = dot(djw[1], camera.w[2]);
-    let mut dw = [
-        scale(djw[0], fx / z),
-        scale(djw[1], fy / z),
-        add(scale(djw[0], -fx * s.u / z), scale(djw[1], -fy * s.v / z)),
-    ];
-
-    // J -> fx, fy, u, v, z.
-    let mut dfx = (dj11 - dj13 * s.u) / z;
-    let mut dfy = (dj22 - dj23 * s.v) / z;
-    let (mut dcx, mut dcy) = (grad[0], grad[1]);
-    let du = -dj13 * fx / z;
-    let dv = -dj23 * fy / z;
-    let mut dz = grad[2] - (fx * (dj11 - dj13 * s.u) + fy * (dj22 - dj23 * s.v)) / (z * z);
-
-    // Screen mean (not clamped) -> x/z, y/z.
-    let (x_z, y_z) = (s.p[0] / z, s.p[1] / z);
-    dfx += grad[0] * x_z;
-    dfy += grad[1] * y_z;
-    let (mut dx_z, mut dy_z) = (grad[0] * fx, grad[1] * fy);
-
-    // Clamp: inside it passes on; outside u = const / fx - cx / fx is the camera's.
-    if s.u_inside {
-        dx_z += du;
-    } else {
-        dcx -= du / fx;
-        dfx -= du * s.u / fx;
-    }
-    if s.v_inside {
-        dy_z += dv;
-    } else {
-        dcy -= dv / fy;
-        dfy -= dv * s.v / fy;
-    }
-    dz -= (dx_z * x_z + dy_z * y_z) / z;
-
-    // p = W mean + t.
-    let dp = [dx_z / z, dy_z / z, dz];
-    dw = add3(&dw, &outer(dp, g.mean));
+    let [mean_x, mean_y, depth, ..] = grad;
     Gradient {
-        mean: apply_transposed(&camera.w, dp),
+        camera: camera.sight_backward(g.mean, &s.sight, [mean_x, mean_y, depth], djw),
         quat: rotation_backward(s.unit, s.length, &drotation),
         scale: dscale,
-        w: dw,
-        t: dp,
-        intrinsics: [dfx, dfy, dcx, dcy],
     }
 }

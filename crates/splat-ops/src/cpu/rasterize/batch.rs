@@ -4,8 +4,8 @@ use core::ops::Range;
 
 use super::super::real::Real;
 use super::super::simd::prefetch;
-use super::View;
 use super::splat::{BLOCKS, GROUP, Splat};
+use super::view::View;
 
 /// How many: so many that what is kept of each fits the first-level cache, and few enough for eight bits.
 pub(super) const BATCH: usize = 128;
@@ -170,7 +170,7 @@ fn transposed(rows: [u8; 8]) -> [u8; 8] {
     bits.to_le_bytes()
 }
 
-/// Of every byte the bits that are set, and how many they are.
+/// The set bits of every byte, and how many they are.
 static BITS: [([u8; 8], u8); 256] = {
     let mut table = [([0; 8], 0); 256];
     let mut byte = 0;

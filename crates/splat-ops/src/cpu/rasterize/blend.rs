@@ -8,9 +8,8 @@ use core::ops::Range;
 
 use macerator::Simd;
 
-use super::super::intersect::TILE;
 use super::super::real::Real;
-use super::View;
+use super::super::tiles::TILE;
 use super::batch::{BATCH, Batch, by_groups};
 use super::pixels::{Pixels, load_each};
 use super::splat::{
@@ -18,6 +17,7 @@ use super::splat::{
     row_of, square,
 };
 use super::trace::{ByBlock, Trace};
+use super::view::View;
 use super::work::Tally;
 
 /// The pixels of a tile while it is being blended, by block.
@@ -31,7 +31,7 @@ pub(super) struct BlendTile<T> {
     /// D of each block.
     colors: Vec<Aligned<Lanes<T>>>,
     batch: Batch<T>,
-    /// Of every splat that reaches the block at hand: `|z|^2`, then falloffs, then weights.
+    /// Values of every splat that reaches the block at hand: `|z|^2`, then falloffs, then weights.
     weights: [Aligned<Lanes<T>>; BATCH],
 }
 
@@ -361,11 +361,11 @@ impl<T: Real> BlendTile<T> {
     }
 }
 
-/// What is on its way to the pixels of a block, and what of it has arrived.
+/// Light on its way to the pixels of a block, and the part that has arrived.
 struct Light<S: Simd, T: Real, const COUNT: usize> {
     /// Transmittance.
     left: Pixels<S, T>,
-    /// Of a group of channels.
+    /// Colours of a group of channels.
     colors: [Pixels<S, T>; COUNT],
 }
 

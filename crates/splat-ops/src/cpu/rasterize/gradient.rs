@@ -23,10 +23,9 @@ use core::ops::Range;
 
 use macerator::{Simd, Vector};
 
-use super::super::intersect::TILE;
 use super::super::real::Real;
 use super::super::simd::prefetch;
-use super::View;
+use super::super::tiles::TILE;
 use super::batch::{BATCH, Batch, ByPlace, by_groups};
 use super::pixels::{Columns, Pixels, four_totals, load_each, total};
 use super::splat::{
@@ -34,9 +33,10 @@ use super::splat::{
     row_mut, row_of, square,
 };
 use super::trace::{ByBlock, TileTrace};
+use super::view::View;
 
 /// Sums per splat before those of its D colours.
-pub(in super::super) const MOMENTS: usize = 6;
+pub(super) const MOMENTS: usize = 6;
 
 /// The pixels of a tile while they are walked back to front, by block.
 pub(super) struct GradientTile<S: Simd, T: Real> {
@@ -45,7 +45,7 @@ pub(super) struct GradientTile<S: Simd, T: Real> {
     /// D of each block: gradient of the image.
     grad: Vec<Aligned<Lanes<T>>>,
     batch: Batch<T>,
-    /// Of every splat that reaches the block at hand.
+    /// Values of every splat that reaches the block at hand.
     pairs: Vec<Aligned<Pairs<T>>>,
     /// c . grad of the same, of channels beyond the first group.
     toward: Vec<Aligned<Lanes<T>>>,
@@ -331,7 +331,7 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
         }
     }
 
-    /// What the loss thinks of some further channels of the splats' colours at every pixel, c . grad.
+    /// Share of some further channels of the splats' colours in the loss at every pixel, c . grad.
     #[inline(always)]
     fn look<const COUNT: usize>(
         &mut self,

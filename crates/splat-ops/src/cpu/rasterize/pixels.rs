@@ -8,7 +8,7 @@ use macerator::{Mask, Simd, Vector};
 use super::super::real::Real;
 use super::splat::{Aligned, LANES, Lanes, SIDE};
 
-/// What is computed of every register, of those that are used.
+/// Computes a value for every register that is used.
 // No closure: the compiler must put every function between the instructions and the one that is compiled for them into the
 // latter, and knows no way to be told so of closures.
 macro_rules! each_register {
@@ -48,7 +48,7 @@ impl<S: Simd, T: Real, const VALUES: usize> Registers<S, T, VALUES> {
         VALUES.div_ceil(T::lanes::<S>())
     }
 
-    /// Of every pixel, or of every column from pixels whose rows are alike.
+    /// Values of every pixel, or of every column of pixels whose rows are alike.
     #[inline(always)]
     pub(super) fn load(lanes: &Lanes<T>) -> Self {
         each_register!(i => register(lanes, i))
@@ -127,13 +127,13 @@ impl<S: Simd, T: Real> Pixels<S, T> {
         powers
     }
 
-    /// What is here where `values >= bound`, and zero elsewhere.
+    /// These values where `values >= bound`, and zero elsewhere.
     #[inline(always)]
     pub(super) fn where_at_least(self, values: Self, bound: Self) -> Self {
         each_register!(i => kept(values.0[i].ge(bound.0[i]), self.0[i]))
     }
 
-    /// What is here where `values < bound`, and zero elsewhere.
+    /// These values where `values < bound`, and zero elsewhere.
     #[inline(always)]
     pub(super) fn where_below(self, values: Self, bound: Self) -> Self {
         each_register!(i => kept(values.0[i].lt(bound.0[i]), self.0[i]))
@@ -180,7 +180,7 @@ impl<S: Simd, T: Real> Columns<S, T> {
     }
 }
 
-/// What is in a register where a mask is set, and zero elsewhere.
+/// A register where a mask is set, and zero elsewhere.
 #[inline(always)]
 fn kept<S: Simd, T: Real>(mask: Mask<S, T>, register: Vector<S, T>) -> Vector<S, T> {
     let bits = bytemuck::bytes_of(&*mask);

@@ -1,27 +1,27 @@
-//! What the forward pass keeps of each row of tiles for the backward pass.
+//! State of each row of tiles that the forward pass keeps for the backward pass.
 
 use core::ops::Range;
 
-use super::super::intersect::TILE;
+use super::super::tiles::TILE;
 use super::batch::BATCH;
 use super::splat::{Aligned, BLOCKS, Lanes};
 
 /// One value per pixel of a tile, by block.
 pub(super) type ByBlock<T> = [Aligned<Lanes<T>>; BLOCKS];
 
-/// Bytes that is kept of each pair of a tile and a splat, at most, with numbers of this size.
-pub(in super::super) const fn kept_per_pair(number: usize) -> usize {
+/// Bytes that are kept of each intersection, at most, with numbers of this size.
+pub(super) const fn kept_per_intersection(number: usize) -> usize {
     size_of::<u16>() + number * (TILE * TILE).div_ceil(BATCH)
 }
 
-/// Of the tiles of a row, one after the other.
+/// State of the tiles of a row, one after the other.
 pub(super) struct Trace<T> {
     /// The blocks that every splat of each tile's list reaches, a bit per block; none from the batch on that found every
     /// pixel stopped.
     pub(super) reached: Vec<u16>,
     /// The place in the list of the splat before which each pixel stopped; `i32::MAX` where it did not.
     pub(super) stop: Vec<ByBlock<i32>>,
-    /// What is left of the light in front of every batch of a list but the first, as far as there is any, and, if there is a
+    /// Transmittance in front of every batch of a list but the first, as far as there is any, and, if there is a
     /// background, behind the last splat. One minus alpha would lose its digits.
     pub(super) transmittance: Vec<ByBlock<T>>,
     /// Where each tile's end among these.
@@ -36,7 +36,7 @@ pub(super) struct TileTrace<'a, T> {
 }
 
 impl<T> Trace<T> {
-    /// Of so many tiles, with so many splats in their lists together.
+    /// Room for this many tiles, with this many splats in their lists together.
     pub(super) fn with_capacity(tiles: usize, splats: usize) -> Self {
         Self {
             reached: Vec::with_capacity(splats),

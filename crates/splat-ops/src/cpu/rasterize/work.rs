@@ -5,19 +5,20 @@ use macerator::Simd;
 use rayon::prelude::*;
 
 use super::blend::BlendTile;
+use super::inputs::Camera;
 use super::splat::LANES;
 use super::trace::Trace;
-use super::{Camera, Listed, View};
+use super::view::{Listed, View};
 use crate::backend::PROJECTED_WIDTH;
 use crate::rasterize::{check_settings, per_camera};
 use crate::settings::RasterizeArgs;
 use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
 
-/// What [`rasterize`](crate::rasterize) does, in numbers.
+/// Work of [`rasterize`](crate::rasterize), in numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct RasterizeWork {
-    /// Pairs of a tile and a splat that is listed in it.
-    pub instances: u64,
+    /// Listed intersections of splats and tiles.
+    pub intersections: u64,
     /// Pairs of a pixel and a splat whose alpha the forward pass evaluates. The backward pass evaluates about as many.
     pub tested: u64,
     /// Those of them whose alpha reaches `alpha_min`; on the CPU beyond the image's edges too, in the tiles that lie across.
@@ -39,15 +40,15 @@ pub fn rasterize_work<const DC: usize, const DO: usize>(
     check_settings(settings)?;
     let (colors, opacities) = per_camera(projected, colors, opacities)?;
     let [c, n, d] = colors.dims();
-    let host = |tensor: Tensor<3>| {
+    let to_host = |tensor: Tensor<3>| {
         tensor
             .into_data()
             .convert::<f32>()
             .try_into_vec::<f32>()
             .unwrap_or_default()
     };
-    let (packed, colors) = (host(projected.packed()), host(colors));
-    let opacities = host(opacities.reshape([c as i32, -1, 1]));
+    let (packed, colors) = (to_host(projected.packed()), to_host(colors));
+    let opacities = to_host(opacities.reshape([c as i32, -1, 1]));
     let args = RasterizeArgs {
         size: projected.image_size(),
         settings: *settings,
@@ -82,7 +83,7 @@ fn of_camera(camera: &Camera<f32>, args: &RasterizeArgs) -> Result<RasterizeWork
         sum.add(&tile);
         sum
     });
-    work.instances = view.lists.instances() as u64;
+    work.intersections = view.lists.intersections() as u64;
     Ok(work)
 }
 
@@ -98,7 +99,7 @@ fn count_tile<'a, S: Simd>(view: &View<'a, f32>, tile: [usize; 2], work: &mut Ra
 
 impl RasterizeWork {
     fn add(&mut self, other: &Self) {
-        self.instances += other.instances;
+        self.intersections += other.intersections;
         self.tested += other.tested;
         self.seen += other.seen;
         self.blended += other.blended;
@@ -175,7 +176,7 @@ mod tests {
                 );
                 let (z1, z2) = (row[3] * dx, row[4] * dx + row[5] * dy);
                 let alpha = f64::from(*opacity) * (-(z1 * z1 + z2 * z2) / 2.0).exp();
-                seen += u64::from(alpha >= 1.0 / 255.0);
+                seen += u64::from(alpha >= splat_core::ALPHA_MIN);
             }
         }
         let count = |packed: Vec<f32>, opacities: Vec<f32>| {
@@ -191,7 +192,7 @@ mod tests {
         assert!(missed <= 2, "{work:?}, brute force {seen}");
         assert!(work.seen >= work.blended);
         assert!(work.tested < 2 * work.seen, "{work:?}");
-        assert!(work.instances < 12 * n as u64, "{work:?}");
+        assert!(work.intersections < 12 * n as u64, "{work:?}");
 
         // Two walls at the cap in front leave less than the rest may take away.
         let wall = [30.0, 22.0, 0.1, 1e-4, 0.0, 1e-4, 1.0, 1e5, 1e5f32];

@@ -1,11 +1,11 @@
-//! What belongs to the Gaussians: activations.
+//! `exp` and the logistic function.
 
 use burn::backend::{Backend, tensor::FloatTensor};
 
-use crate::activation::Activation;
+use crate::settings::Activation;
 
 /// The function of every element.
-pub(crate) fn activate<B: Backend>(x: FloatTensor<B>, function: Activation) -> FloatTensor<B> {
+pub(crate) fn activation<B: Backend>(x: FloatTensor<B>, function: Activation) -> FloatTensor<B> {
     match function {
         Activation::Exp => B::float_exp(x),
         // exp(min(x, 0)) / (1 + exp(-|x|)): neither exponent is positive.
@@ -23,18 +23,18 @@ fn one_and_small<B: Backend>(x: FloatTensor<B>) -> (FloatTensor<B>, FloatTensor<
 }
 
 /// `grad y'`; of the logistic function `y' = e / (1 + e)^2`, which keeps its digits at both ends.
-pub(crate) fn activate_backward<B: Backend>(
+pub(crate) fn activation_backward<B: Backend>(
     x: FloatTensor<B>,
     y: FloatTensor<B>,
-    grad: FloatTensor<B>,
+    grad_y: FloatTensor<B>,
     function: Activation,
 ) -> FloatTensor<B> {
     match function {
-        Activation::Exp => B::float_mul(grad, y),
+        Activation::Exp => B::float_mul(grad_y, y),
         Activation::Sigmoid => {
             let (small, one) = one_and_small::<B>(x);
             let slope = B::float_div(B::float_div(small, one.clone()), one);
-            B::float_mul(grad, slope)
+            B::float_mul(grad_y, slope)
         }
     }
 }

@@ -6,8 +6,8 @@ use cubecl::features::{AtomicUsage, Plane};
 use crate::launch::{MOST_BUFFERS, bindable_buffers};
 use crate::{rasterize, sort};
 
-/// What is known of the client's device, by name, in an order for reading.
-pub fn describe(client: &Client) -> Vec<(&'static str, String)> {
+/// Properties of the client's device, by name, in an order for reading.
+pub fn device_info(client: &Client) -> Vec<(&'static str, String)> {
     let (identity, hardware) = (&client.properties().identity, &client.properties().hardware);
     let planes = match (hardware.plane_size_min, hardware.plane_size_max) {
         (least, most) if least == most => format!("{most} units"),

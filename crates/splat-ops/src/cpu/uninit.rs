@@ -73,7 +73,7 @@ impl<T: Overwritten> Uncleared<T> {
             .collect()
     }
 
-    /// What was written.
+    /// The written memory.
     ///
     /// # Panics
     /// If a part was never cleared, which is a mistake of the caller's and depends on no input.

@@ -1,0 +1,172 @@
+//! The emitted tiles of all splats brought together tile by tile, and sorted there.
+
+use core::sync::atomic::{AtomicU32, Ordering::Relaxed};
+
+use rayon::prelude::*;
+
+use super::TileLists;
+use super::emit::Emitted;
+use crate::cpu::buffer::overwritten;
+use crate::cpu::real::Real;
+use crate::cpu::tiles::{CHUNK, Grid};
+use crate::cpu::uninit::{Part, Uncleared};
+
+/// Parts that the counting sort is done in, at most: each counts the tiles for itself.
+const PARTS: usize = 16;
+
+/// The emitted intersections brought together tile by tile, in the order in which they were emitted.
+pub(super) struct ByTile {
+    /// By emitted intersection: its splat.
+    owners: Vec<u32>,
+    /// Where the emitted intersections of each splat end.
+    ends: Vec<u32>,
+    /// The emitted intersections by tile.
+    intersections: Vec<AtomicU32>,
+    /// Where each tile's begin, and the last one's end.
+    tiles: Vec<u32>,
+}
+
+impl ByTile {
+    /// By a counting sort.
+    pub(super) fn new(emitted: &[Emitted], splats: usize, grid: Grid) -> Self {
+        let length = emitted.len().div_ceil(PARTS).max(1);
+        let mut counts: Vec<Vec<u32>> = emitted
+            .par_chunks(length)
+            .map(|part| {
+                let mut counts = vec![0; grid.tiles()];
+                for tile in part.iter().flat_map(|emitted| &emitted.tiles) {
+                    counts[*tile as usize] += 1;
+                }
+                counts
+            })
+            .collect();
+        // From how many there are to where they go: tile by tile, and in a tile part by part.
+        let mut tiles = Vec::with_capacity(grid.tiles() + 1);
+        let mut next = 0;
+        for tile in 0..grid.tiles() {
+            tiles.push(next);
+            for counts in &mut counts {
+                let own = core::mem::replace(&mut counts[tile], next);
+                next += own;
+            }
+        }
+        tiles.push(next);
+
+        let intersections = unset(next as usize);
+        let mut owners = Uncleared::<u32>::new(next as usize);
+        let mut ends = Uncleared::<u32>::new(splats);
+        let mut start = 0;
+        let of_owners = owners.parts(emitted.iter().map(|emitted| emitted.tiles.len()));
+        let pieces: Vec<Piece> = (emitted.iter().zip(of_owners).zip(ends.chunks(CHUNK)))
+            .zip((0..).step_by(CHUNK))
+            .map(|(((emitted, owners), ends), first)| {
+                let next = start + emitted.tiles.len() as u32;
+                Piece {
+                    emitted,
+                    first,
+                    start: core::mem::replace(&mut start, next),
+                    owners,
+                    ends,
+                }
+            })
+            .collect();
+        pieces
+            .into_par_iter()
+            .chunks(length)
+            .zip(counts)
+            .for_each(|(part, mut next)| {
+                for piece in part {
+                    piece.place(&mut next, &intersections);
+                }
+            });
+        Self {
+            owners: owners.written(),
+            ends: ends.written(),
+            intersections,
+            tiles,
+        }
+    }
+
+    /// The lists of the given Gaussians: each tile's intersections front to back, and in the order of the Gaussians
+    /// where their splats are equally deep.
+    pub(super) fn sorted<T: Real>(self, listed: Vec<u32>, depths: &[T]) -> TileLists {
+        let count = self.intersections.len();
+        let mut splats = Uncleared::<u32>::new(count);
+        let places = unset(count);
+        splats
+            .parts(
+                self.tiles
+                    .windows(2)
+                    .map(|ends| (ends[1] - ends[0]) as usize),
+            )
+            .into_par_iter()
+            .zip(&self.tiles)
+            .for_each_init(Vec::new, |keys, (splats, first)| {
+                let splats = splats.overwritten();
+                keys.clear();
+                // Intersections are numbered as the splats are.
+                let intersections = &self.intersections[*first as usize..][..splats.len()];
+                keys.extend(intersections.iter().map(|intersection| {
+                    let intersection = intersection.load(Relaxed);
+                    let depth = depths[self.owners[intersection as usize] as usize];
+                    depth.sort_key(intersection)
+                }));
+                keys.sort_unstable();
+                for ((splat, place), key) in splats.iter_mut().zip(*first..).zip(&*keys) {
+                    let intersection = T::index_of(*key) as usize;
+                    places[intersection].store(place, Relaxed);
+                    *splat = self.owners[intersection];
+                }
+            });
+        TileLists {
+            listed,
+            ends: self.ends,
+            places,
+            splats: splats.written(),
+            tiles: self.tiles,
+        }
+    }
+}
+
+/// Tiles that a chunk of splats emitted, and where they go.
+struct Piece<'a> {
+    emitted: &'a Emitted,
+    /// The first of the splats.
+    first: u32,
+    /// The first of the intersections.
+    start: u32,
+    owners: Part<'a, u32>,
+    ends: Part<'a, u32>,
+}
+
+impl Piece<'_> {
+    /// Puts each intersection to the next place of its tile.
+    fn place(self, next: &mut [u32], intersections: &[AtomicU32]) {
+        let Emitted { tiles, ends, .. } = self.emitted;
+        // How many splats begin at an intersection, and with their sum which splat it is of.
+        let owners = self.owners.cleared();
+        for ((end, own), splat) in self.ends.overwritten().iter_mut().zip(ends).zip(1..) {
+            *end = self.start + own;
+            if let Some(owner) = owners.get_mut(*own as usize) {
+                *owner = splat;
+            }
+        }
+        let mut splat = 0;
+        for owner in owners {
+            splat = splat.max(*owner);
+            *owner = self.first + splat;
+        }
+        // The places of one piece are anywhere, but no two pieces have one in common.
+        for (tile, intersection) in tiles.iter().zip(self.start..) {
+            let place = &mut next[*tile as usize];
+            intersections[*place as usize].store(intersection, Relaxed);
+            *place += 1;
+        }
+    }
+}
+
+/// Memory that several threads write, each its own places. Every place is written before any is read.
+fn unset(len: usize) -> Vec<AtomicU32> {
+    let values = overwritten::<u32>(len).into_iter();
+    values.map(AtomicU32::new).collect()
+}
