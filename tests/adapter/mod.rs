@@ -2,26 +2,14 @@
 
 use std::sync::OnceLock;
 
-use burn::tensor::Device;
+use burn_splat::burn::tensor::Device;
+use splat_test_support::adapter_or_skip;
 
-/// wgpu's adapter, a software one included. Set `SPLAT_REQUIRE_WGPU=1` to make a missing one a failure instead of a skip.
+/// wgpu's adapter, a software one included.
 pub fn adapter() -> Option<Device> {
     // A process can open it once.
     static ADAPTER: OnceLock<Option<Device>> = OnceLock::new();
-    ADAPTER.get_or_init(open).clone()
-}
-
-fn open() -> Option<Device> {
-    match Device::wgpu_options().init() {
-        Ok(device) => Some(device),
-        Err(error) => {
-            let message = format!("no wgpu adapter, the CubeCL kernels are NOT checked: {error}");
-            assert!(
-                std::env::var_os("SPLAT_REQUIRE_WGPU").is_none(),
-                "SPLAT_REQUIRE_WGPU is set, but {message}"
-            );
-            eprintln!("\n*** SKIPPED: {message} ***\n");
-            None
-        }
-    }
+    ADAPTER
+        .get_or_init(|| adapter_or_skip(Device::wgpu_options().init()))
+        .clone()
 }

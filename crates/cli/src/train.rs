@@ -99,9 +99,8 @@ impl TrainArgs {
         config.seed = global.seed.unwrap_or(config.seed);
         config.init.sh_degree = self.sh_degree.unwrap_or(config.init.sh_degree);
         config.density.max_gaussians = self.max_gaussians.or(config.density.max_gaussians);
-        if let Some(problem) = config.problem() {
-            return Err(Failure::BadInput(format!("settings: {problem}")));
-        }
+        let invalid = |problem: String| Failure::BadInput(format!("settings: {problem}"));
+        config.validate().map_err(invalid)?;
         if let Some(run) = resumed {
             run.checkpoint.check_settings(&config)?;
         }

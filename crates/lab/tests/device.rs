@@ -10,6 +10,7 @@ use splat_data::{Capture, CaptureOptions};
 use splat_lab::performance::scaling::{PhotoSize, synthetic_capture};
 use splat_lab::performance::{PER_GAUSSIAN_AT_REST, device_step};
 use splat_ops::device::kernel_work;
+use splat_test_support::adapter_or_skip;
 use splat_trainer::{TrainConfig, Trained, Trainer};
 
 static ALONE: Mutex<()> = Mutex::new(());
@@ -19,14 +20,7 @@ fn adapter() -> Option<(MutexGuard<'static, ()>, Device)> {
     static ADAPTER: std::sync::OnceLock<Option<Device>> = std::sync::OnceLock::new();
     let guard = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     // A process can open it once.
-    let device = ADAPTER.get_or_init(|| Device::wgpu_options().init().ok());
-    if device.is_none() {
-        assert!(
-            std::env::var_os("SPLAT_REQUIRE_WGPU").is_none(),
-            "no wgpu adapter"
-        );
-        eprintln!("\n*** SKIPPED: no wgpu adapter, training on a device was NOT tested ***\n");
-    }
+    let device = ADAPTER.get_or_init(|| adapter_or_skip(Device::wgpu_options().init()));
     Some((guard, device.clone()?))
 }
 

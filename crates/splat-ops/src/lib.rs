@@ -54,7 +54,7 @@ pub use cubecl;
 #[cfg(feature = "cpu")]
 pub use device::rasterize_work;
 pub use error::{ErrorSlot, OpError};
-pub use photometric::{Photometric, Target, photometric};
+pub use photometric::{Photometric, Target, photometric, photometric_masked};
 pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};
 pub use screen_statistics::ScreenStatistics;

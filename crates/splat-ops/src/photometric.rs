@@ -103,3 +103,64 @@ pub fn photometric(
         losses: Tensor::from_dispatch(losses),
     })
 }
+
+/// [`photometric`] of the pixels that a mask `[B, H, W, 1]` keeps (1; 0 leaves out), as gsplat has it: the mean absolute
+/// difference is that of the pixels kept, the structural similarity that of both images times the mask. A mask that keeps
+/// nothing gives a difference of zero.
+///
+/// Without a mask call [`photometric`], which reads bytes as they are; here the target becomes floats.
+///
+/// ```
+/// use burn::tensor::{Device, Tensor};
+/// use splat_ops::{SsimArgs, photometric_masked};
+///
+/// let device = Device::flex();
+/// let rendered = Tensor::<4>::ones([1, 16, 16, 3], &device);
+/// let target = Tensor::<4>::zeros([1, 16, 16, 3], &device);
+/// // The upper half counts.
+/// let kept = Tensor::<4>::ones([1, 8, 16, 1], &device);
+/// let mask = Tensor::cat(vec![kept.clone(), kept.zeros_like()], 1);
+/// let args = SsimArgs { window: vec![0.25, 0.5, 0.25], c1: 1e-4, c2: 9e-4 };
+/// let measured = photometric_masked(rendered, target, mask, &args)?;
+/// assert_eq!(measured.l1().into_scalar::<f32>(), 1.0);
+/// # Ok::<(), splat_ops::OpError>(())
+/// ```
+///
+/// # Errors
+/// As those of [`photometric`], and when the mask does not fit or is tracked by autodiff.
+pub fn photometric_masked(
+    rendered: Tensor<4>,
+    target: impl Into<Target>,
+    mask: Tensor<4>,
+    args: &SsimArgs,
+) -> Result<Photometric, OpError> {
+    let check = Checker::new("photometric_masked", "rendered", &rendered)?;
+    let [b, h, w, _] = rendered.dims();
+    check.tensor("mask", &mask, [b, h, w, 1].map(Some), "[B, H, W, 1]")?;
+    if mask.is_tracked() {
+        return Err(
+            check.argument("`mask` is a constant, but autodiff tracks it; detach it".into())
+        );
+    }
+    let values = match target.into() {
+        Target::Levels(levels) => levels.float() / 255.0,
+        Target::Values(values) => values,
+    };
+    let [.., channels] = values.dims();
+    check.tensor(
+        "target",
+        &values,
+        [Some(b), Some(h), Some(w), None],
+        "[B, H, W, D]",
+    )?;
+    let kept = mask.clone().sum();
+    let masked = rendered.clone() * mask.clone().repeat_dim(3, rendered.dims()[3]);
+    let values = values * mask.repeat_dim(3, channels);
+    let losses = photometric(masked, values, args)?.losses();
+    // Of a mean over all pixels that over the pixels kept.
+    let share = kept.clamp_min(1.0).recip() * (b * h * w) as f64;
+    let scale = Tensor::cat(vec![share.clone(), share.ones_like()], 0);
+    Ok(Photometric {
+        losses: losses * scale,
+    })
+}

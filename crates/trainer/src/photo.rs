@@ -5,11 +5,11 @@ use splat_data::View;
 
 /// The photo of a view, `[1, H, W, 3]` in [0, 1].
 pub fn photo(view: &View, device: &Device) -> Tensor<4> {
-    values(levels(view, device))
+    values(pixels_u8(view, device))
 }
 
-/// The photo of a view as it is stored, 8-bit levels `[1, H, W, 3]`: of type U8 where the device can compute with it.
-pub(crate) fn levels(view: &View, device: &Device) -> Tensor<4, Int> {
+/// The photo of a view as it is stored, 8 bits a value, `[1, H, W, 3]`: of type U8 where the device can compute with it.
+pub(crate) fn pixels_u8(view: &View, device: &Device) -> Tensor<4, Int> {
     let dtype = match device.supports_dtype(DType::U8) {
         true => DType::U8,
         false => DType::I32,
@@ -19,6 +19,6 @@ pub(crate) fn levels(view: &View, device: &Device) -> Tensor<4, Int> {
 }
 
 /// Levels from 0 to 255 as values in [0, 1].
-pub(crate) fn values(levels: Tensor<4, Int>) -> Tensor<4> {
-    levels.float() / 255.0
+pub(crate) fn values(pixels: Tensor<4, Int>) -> Tensor<4> {
+    pixels.float() / 255.0
 }

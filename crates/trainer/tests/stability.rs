@@ -221,7 +221,7 @@ fn photos_of_noise_are_named() {
 #[test]
 fn high_learning_rates_are_named_with_their_factor() {
     let mut config = config();
-    let rates = &mut config.rates;
+    let rates = &mut config.learning_rates;
     for rate in [
         &mut rates.means,
         &mut rates.scales,
@@ -296,8 +296,8 @@ fn an_opacity_that_nothing_could_bring_back_is_refused() {
     for (field, change) in changes {
         let mut config = config();
         change(&mut config);
-        let problem = config.problem().unwrap();
+        let problem = config.validate().unwrap_err();
         assert!(problem.contains(field), "{problem}");
     }
-    assert_eq!(config().problem(), None);
+    assert_eq!(config().validate(), Ok(()));
 }

@@ -12,15 +12,10 @@ use crate::{
 /// Whether there is a wgpu adapter, a software one included.
 pub(crate) fn has_adapter() -> bool {
     use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
-    let found = [DefaultDevice, Cpu]
+    let opened = [DefaultDevice, Cpu]
         .into_iter()
-        .any(|kind| cubecl::Device::wgpu(kind).is_ok());
-    if !found {
-        eprintln!(
-            "\n*** SKIPPED: no wgpu adapter on this machine, the kernels were NOT tested ***\n"
-        );
-    }
-    found
+        .find_map(|kind| cubecl::Device::wgpu(kind).ok());
+    splat_test_support::adapter_or_skip(opened.ok_or("neither a GPU nor a software one")).is_some()
 }
 
 struct Scene {

@@ -238,3 +238,58 @@ fn what_does_not_fit_is_refused() {
     };
     assert!(photometric(zeros([1, 12, 13, 3]), zeros([1, 12, 13, 3]), &even).is_err());
 }
+
+/// Pixels that the mask leaves out count in neither value nor gradient, and one that keeps all is none.
+#[test]
+fn a_mask_leaves_pixels_out() {
+    for (_, device) in devices() {
+        let shape = [2, 24, 32, 3, 4];
+        let [b, h, w, ..] = shape;
+        let pair = pair(shape);
+        let device = device.autodiff();
+        let at = (&device, DType::F32);
+        let masked = |change: f32, keep: usize| {
+            let rendered = Tensor::<4>::from_data(pair.rendered.clone(), at);
+            let target = Tensor::<4>::from_data(pair.values.clone(), at).detach();
+            let kept = Tensor::<4>::ones([b, keep, w, 1], &device);
+            let left_out = Tensor::<4>::zeros([b, h - keep, w, 1], &device);
+            let mask = Tensor::cat(vec![kept, left_out.clone()], 1);
+            // What is left out is anything.
+            let change = (mask.clone() - 1.0).repeat_dim(3, 4) * change;
+            let rendered = (rendered + change).detach().require_grad();
+            let measured = crate::photometric_masked(rendered.clone(), target, mask, &args());
+            let measured = measured.unwrap();
+            outcome(rendered, [measured.l1(), measured.ssim()])
+        };
+        let [plain, other] = [0.0, 3.0].map(|change| masked(change, 10));
+        assert_eq!(plain, other);
+        let row = w * 4;
+        for image in plain[2].chunks(h * row) {
+            assert!(image[10 * row..].iter().all(|gradient| *gradient == 0.0));
+            assert!(image[..10 * row].iter().any(|gradient| *gradient != 0.0));
+        }
+        // L1 by hand: over the pixels kept.
+        let rendered = pair.rendered.clone().try_into_vec::<f32>().unwrap();
+        let values = pair.values.clone().try_into_vec::<f32>().unwrap();
+        let pixels = (0..b * h * w).filter(|pixel| pixel / w % h < 10);
+        let difference = |pixel: usize| -> f64 {
+            let of = |d: usize| f64::from((rendered[pixel * 4 + d] - values[pixel * 3 + d]).abs());
+            (0..3).map(of).sum()
+        };
+        let l1 = pixels.map(difference).sum::<f64>() / (b * 10 * w * 3) as f64;
+        assert!(
+            (plain[0][0] / l1 - 1.0).abs() < 1e-5,
+            "{} {l1}",
+            plain[0][0]
+        );
+
+        let whole = masked(0.0, h);
+        let rendered = Tensor::<4>::from_data(pair.rendered.clone(), at).require_grad();
+        let target = Tensor::<4>::from_data(pair.values.clone(), at).detach();
+        let measured = photometric(rendered.clone(), target, &args()).unwrap();
+        let expected = outcome(rendered, [measured.l1(), measured.ssim()]);
+        for (whole, expected) in whole.iter().flatten().zip(expected.iter().flatten()) {
+            assert!((whole - expected).abs() <= 1e-6 * expected.abs().max(1e-3));
+        }
+    }
+}

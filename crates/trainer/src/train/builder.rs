@@ -21,7 +21,7 @@ use super::state::State;
 use super::trainer::Trainer;
 use super::{
     Checkpoint, CheckpointError, History, IntoLoss, LossTerms, Progress, TrainConfig, TrainError,
-    Warning, coarse, views,
+    Warning, resolution_schedule, views,
 };
 
 type MakeModel<M> = dyn FnOnce(&SplatData, &Device) -> M + Send;
@@ -207,9 +207,7 @@ impl<M: SplatModel> TrainerBuilder<M> {
     /// When there is nothing in the capture to train on, a setting is out of range, the model, the strategy or a hook
     /// cannot be used, or the checkpoint to resume from is another run's.
     pub fn build(mut self) -> Result<Trainer<M>, TrainError> {
-        if let Some(problem) = self.config.problem() {
-            return Err(TrainError::Config(problem));
-        }
+        self.config.validate().map_err(TrainError::Config)?;
         self.capture.check_trainable()?;
         check_hook_names(&self.hooks)?;
         let loss = self.loss.take();
@@ -279,7 +277,7 @@ impl<M: SplatModel> TrainerBuilder<M> {
             state,
             record,
             losses: LossLog::default(),
-            coarse: coarse::CoarseViews::default(),
+            coarse: resolution_schedule::CoarseViews::default(),
         })
     }
 }
@@ -309,7 +307,7 @@ fn optimized<M: SplatModel>(
     scene: SceneScale,
     optimizer: &MakeOptimizer,
 ) -> Result<Optimized<M>, TrainError> {
-    let fields = model.fields(&config.rates);
+    let fields = model.fields(&config.learning_rates);
     let usual = |field: &Field| SplatAdam::of_field(field, config.adam_rows(), scene).into();
     let optimizer = |field: &Field| optimizer(field).unwrap_or_else(|| usual(field));
     Optimized::new(model, fields, optimizer).map_err(|error| TrainError::Setup(error.to_string()))

@@ -12,8 +12,10 @@ use splat_data::text::{one_line, utf8};
 
 /// What has more bytes is no file of settings, and reading it as one could take all memory.
 const LONGEST: usize = 1 << 20;
-/// More would leave no photo anything to see.
+/// Beyond this, images shrink to nothing.
 const MOST_HALVINGS: u32 = 8;
+/// Views of a step, all of whose pictures are in memory at once.
+const MOST_VIEWS: usize = 64;
 
 /// More steps are no run: at a thousand a second they take thirty years. Quarters of it and the like can be computed.
 pub(super) const MOST_STEPS: u64 = 1_000_000_000_000;
@@ -53,8 +55,9 @@ pub struct TrainConfig {
     pub deterministic: bool,
     /// The first Gaussians.
     pub init: InitSettings,
-    /// Learning rates.
-    pub rates: LearningRates,
+    /// Learning rates; `rates` in files of before.
+    #[serde(alias = "rates")]
+    pub learning_rates: LearningRates,
     /// Adaptive density control. Where `max_gaussians` is absent, growth ends at seven Gaussians for every ten pixels of a
     /// photo, or one for every hundred of all photos that are trained on (300 values for up to 59 parameters), whichever is
     /// more; docs/TRAINING.md has what more would give.
@@ -84,7 +87,7 @@ impl Default for TrainConfig {
             seen_rows_only: false,
             deterministic: true,
             init: InitSettings::default(),
-            rates: LearningRates::default(),
+            learning_rates: LearningRates::default(),
             density: AdcSettings::default(),
         }
     }
@@ -152,106 +155,121 @@ impl TrainConfig {
         }
     }
 
-    /// An opacity that gradients could not bring back: below the cut nothing is drawn and nothing learns, and what a reset
-    /// leaves below the opacity of pruning is removed.
-    fn unreachable_opacity(&self) -> Option<String> {
-        let cut = RasterizeSettings::default().alpha_min;
-        let starts = [
-            ("init.opacity", self.init.opacity),
-            ("density.reset_opacity", self.density.reset_opacity),
-        ];
-        if let Some((field, value)) = starts.iter().find(|(_, value)| *value <= cut) {
-            return Some(format!(
-                "`{field}` must be above 1/255, below which nothing is drawn or learned, it is {value}"
+    /// Checks that the settings can be used.
+    ///
+    /// # Errors
+    /// What makes them unusable: the field and the reason, in a line.
+    pub fn validate(&self) -> Result<(), String> {
+        self.check_counts()?;
+        self.check_rates_and_shares()?;
+        self.check_reachable_opacities()?;
+        if let Some(color) = self.background
+            && !color.iter().all(|channel| channel.is_finite())
+        {
+            return Err(format!("`background` must be finite, it is {color:?}"));
+        }
+        let (degree, highest) = (self.init.sh_degree, splat_model::ops::SH_DEGREE_MAX);
+        if degree > highest {
+            return Err(format!(
+                "`init.sh_degree` must be 0 to {highest}, it is {degree}"
             ));
         }
-        let (reset, prune) = (self.density.reset_opacity, self.density.prune_opacity);
-        (reset <= prune).then(|| {
-            format!(
-                "`density.reset_opacity` {reset} must be above `density.prune_opacity` {prune}, or every reset removes the scene"
-            )
-        })
+        Ok(())
     }
 
-    /// What makes the settings unusable, if anything does: the field and the reason.
-    pub fn problem(&self) -> Option<String> {
-        let finite_positive = [
-            ("rates.means", self.rates.means),
-            ("rates.means_final", self.rates.means_final),
-            ("rates.scales", self.rates.scales),
-            ("rates.quats", self.rates.quats),
-            ("rates.opacities", self.rates.opacities),
-            ("rates.sh0", self.rates.sh0),
-            ("rates.sh_rest", self.rates.sh_rest),
-            ("init.scale", self.init.scale),
-        ];
-        // Infinity is a way to say never.
-        let not_negative = [
-            ("density.grow_gradient", self.density.grow_gradient),
-            ("density.split_scale", self.density.split_scale),
-            ("density.prune_scale", self.density.prune_scale),
-        ];
-        let shares = [
-            ("init.opacity", self.init.opacity),
-            ("ssim_weight", self.ssim_weight),
-            ("density.prune_opacity", self.density.prune_opacity),
-            ("density.reset_opacity", self.density.reset_opacity),
-        ];
+    fn check_counts(&self) -> Result<(), String> {
         let counts = [
             ("steps", self.steps),
             ("views_per_step", self.views_per_step),
+            ("downscale", self.downscale as usize),
             ("coarse_every", self.coarse_every),
             ("sh_degree_every", self.sh_degree_every),
             ("density.every", self.density.every),
             ("density.reset_every", self.density.reset_every),
         ];
         if let Some((field, _)) = counts.iter().find(|(_, value)| *value == 0) {
-            return Some(format!("`{field}` must be at least 1"));
+            return Err(format!("`{field}` must be at least 1"));
         }
         if self.steps as u64 > MOST_STEPS {
-            return Some(format!(
+            return Err(format!(
                 "`steps` must be at most {MOST_STEPS}, it is {}",
                 self.steps
             ));
         }
-        if self.downscale == 0 {
-            return Some("`downscale` must be at least 1".into());
+        if self.views_per_step > MOST_VIEWS {
+            let views = self.views_per_step;
+            return Err(format!(
+                "`views_per_step` must be at most {MOST_VIEWS}, it is {views}"
+            ));
         }
         if self.coarse_halvings > MOST_HALVINGS {
-            return Some(format!(
+            return Err(format!(
                 "`coarse_halvings` must be 0 to {MOST_HALVINGS}, it is {}",
                 self.coarse_halvings
             ));
         }
-        if let Some((field, value)) = finite_positive
-            .iter()
-            .find(|(_, value)| !(value.is_finite() && *value > 0.0))
-        {
-            return Some(format!(
+        Ok(())
+    }
+
+    fn check_rates_and_shares(&self) -> Result<(), String> {
+        let rates = &self.learning_rates;
+        let finite_positive = [
+            ("learning_rates.means", rates.means),
+            ("learning_rates.means_final", rates.means_final),
+            ("learning_rates.scales", rates.scales),
+            ("learning_rates.quats", rates.quats),
+            ("learning_rates.opacities", rates.opacities),
+            ("learning_rates.sh0", rates.sh0),
+            ("learning_rates.sh_rest", rates.sh_rest),
+            ("init.scale", self.init.scale),
+        ];
+        let usable = |value: f64| value.is_finite() && value > 0.0;
+        if let Some((field, value)) = finite_positive.iter().find(|(_, value)| !usable(*value)) {
+            return Err(format!(
                 "`{field}` must be positive and finite, it is {value}"
             ));
         }
+        // Infinity is a way to say never.
+        let not_negative = [
+            ("density.grow_gradient", self.density.grow_gradient),
+            ("density.split_scale", self.density.split_scale),
+            ("density.prune_scale", self.density.prune_scale),
+        ];
         if let Some((field, value)) = not_negative.iter().find(|(_, value)| !(*value >= 0.0)) {
-            return Some(format!("`{field}` must be at least 0, it is {value}"));
+            return Err(format!("`{field}` must be at least 0, it is {value}"));
         }
-        if let Some(color) = self.background
-            && !color.iter().all(|channel| channel.is_finite())
-        {
-            return Some(format!("`background` must be finite, it is {color:?}"));
+        let shares = [
+            ("init.opacity", self.init.opacity),
+            ("ssim_weight", self.ssim_weight),
+            ("density.prune_opacity", self.density.prune_opacity),
+            ("density.reset_opacity", self.density.reset_opacity),
+        ];
+        match shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
+            Some((field, value)) => Err(format!("`{field}` must lie in [0, 1), it is {value}")),
+            None => Ok(()),
         }
-        if let Some((field, value)) = shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
-            return Some(format!("`{field}` must lie in [0, 1), it is {value}"));
+    }
+
+    /// Refuses opacities that gradients could not bring back: below the cut nothing is drawn and nothing learns, and what
+    /// a reset leaves below the opacity of pruning is removed.
+    fn check_reachable_opacities(&self) -> Result<(), String> {
+        let cut = RasterizeSettings::default().alpha_min;
+        let starts = [
+            ("init.opacity", self.init.opacity),
+            ("density.reset_opacity", self.density.reset_opacity),
+        ];
+        if let Some((field, value)) = starts.iter().find(|(_, value)| *value <= cut) {
+            return Err(format!(
+                "`{field}` must be above 1/255, below which nothing is drawn or learned, it is {value}"
+            ));
         }
-        if let Some(problem) = self.unreachable_opacity() {
-            return Some(problem);
+        let (reset, prune) = (self.density.reset_opacity, self.density.prune_opacity);
+        if reset <= prune {
+            return Err(format!(
+                "`density.reset_opacity` {reset} must be above `density.prune_opacity` {prune}, or every reset removes the scene"
+            ));
         }
-        let highest = splat_model::ops::SH_DEGREE_MAX;
-        (self.init.sh_degree > highest).then(|| {
-            format!(
-                "`init.sh_degree` must be 0 to {highest}, it is {}",
-                self.init.sh_degree
-            )
-        })
+        Ok(())
     }
 }
 
@@ -292,7 +310,7 @@ mod tests {
             background: Some([0.0, 0.1, 1.0]),
             ..TrainConfig::default()
         };
-        config.rates.means = 0.1 + 0.2;
+        config.learning_rates.means = 0.1 + 0.2;
         let text = toml::to_string(&config).unwrap();
         for text in [
             text.clone(),
@@ -325,11 +343,11 @@ mod tests {
         let mut there = here.clone();
         assert_eq!(here.difference_in_words(&there), None);
         there.seed = 3;
-        there.rates.sh0 *= 2.0;
+        there.learning_rates.sh0 *= 2.0;
         there.density.max_gaussians = Some(5);
         let words = here.difference_in_words(&there).unwrap();
         assert!(
-            words.starts_with("density.max_gaussians = absent, not 5; rates.sh0 = "),
+            words.starts_with("density.max_gaussians = absent, not 5; learning_rates.sh0 = "),
             "{words}"
         );
         assert!(words.ends_with("; seed = 0, not 3"), "{words}");
@@ -342,7 +360,7 @@ mod tests {
         let problem = |change: &dyn Fn(&mut TrainConfig)| {
             let mut config = TrainConfig::default();
             change(&mut config);
-            config.problem().unwrap_or_default()
+            config.validate().err().unwrap_or_default()
         };
         assert_eq!(problem(&|_| ()), "");
         for value in [f32::NAN, f32::INFINITY] {

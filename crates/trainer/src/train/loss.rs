@@ -18,16 +18,16 @@ pub struct TargetView<'a> {
     pub camera: &'a CameraTensors,
     /// The step, from 0.
     pub step: usize,
-    levels: Tensor<4, Int>,
+    pixels: Tensor<4, Int>,
     /// Made when a loss asks for it.
     image: OnceCell<Tensor<4>>,
 }
 
 impl<'a> TargetView<'a> {
-    /// A view of the photo with these 8-bit levels, `[1, H, W, 3]`.
+    /// A view of the photo with these pixels, 0 to 255, `[1, H, W, 3]`.
     pub fn new(
         name: &'a str,
-        levels: Tensor<4, Int>,
+        pixels: Tensor<4, Int>,
         camera: &'a CameraTensors,
         step: usize,
     ) -> Self {
@@ -35,21 +35,21 @@ impl<'a> TargetView<'a> {
             name,
             camera,
             step,
-            levels,
+            pixels,
             image: OnceCell::new(),
         }
     }
 
     /// The photo, `[1, H, W, 3]` in [0, 1].
     pub fn image(&self) -> Tensor<4> {
-        let make = || values(self.levels.clone());
+        let make = || values(self.pixels.clone());
         self.image.get_or_init(make).clone()
     }
 
-    /// The photo as it is stored, 8-bit levels `[1, H, W, 3]` from 0 to 255: what
+    /// The photo as it is stored, `[1, H, W, 3]` from 0 to 255: what
     /// [`photometric`] reads without a copy in between.
-    pub fn levels(&self) -> Tensor<4, Int> {
-        self.levels.clone()
+    pub fn pixels_u8(&self) -> Tensor<4, Int> {
+        self.pixels.clone()
     }
 }
 
@@ -104,7 +104,7 @@ impl LossTerms {
         let args = SsimSettings::default().args();
         let terms = [("l1", 1.0 - ssim_weight), ("d_ssim", ssim_weight)];
         Self::new().terms(terms, move |view, rendered| {
-            Ok(photometric(rendered.packed(), view.levels(), &args)?.losses())
+            Ok(photometric(rendered.packed(), view.pixels_u8(), &args)?.losses())
         })
     }
 

@@ -3,7 +3,6 @@
 
 mod builder;
 mod checkpoint;
-mod coarse;
 mod commands;
 mod config;
 mod error;
@@ -14,6 +13,7 @@ mod hooks;
 mod loss;
 mod loss_log;
 mod progress;
+mod resolution_schedule;
 mod run;
 mod state;
 mod trainer;

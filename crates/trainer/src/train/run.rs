@@ -22,7 +22,7 @@ impl<M: SplatModel> Trainer<M> {
     pub fn run(mut self) -> Result<Trained<M>, TrainError> {
         if self.state.step == 0 {
             let splats = self.state.model.model().to_data();
-            let found = warnings::start::inspect(&self.capture, &splats, &self.config);
+            let found = warnings::capture_checks::inspect(&self.capture, &splats, &self.config);
             found.into_iter().for_each(|warning| self.warn(warning));
         }
         if let Err(error) = self.advance() {
@@ -63,7 +63,7 @@ impl<M: SplatModel> Trainer<M> {
     fn watched_step(&mut self) -> Result<(), TrainError> {
         self.step()?;
         let (step, steps) = (self.state.step, self.config.steps);
-        if warnings::course::is_due(step, steps) {
+        if warnings::loss_checks::is_due(step, steps) {
             self.inspect_losses();
         }
         let measures = |every: usize| step == steps || step.is_multiple_of(every);
@@ -142,7 +142,7 @@ impl<M: SplatModel> Trainer<M> {
     }
 
     fn inspect_losses(&mut self) {
-        let course = warnings::course::Course {
+        let course = warnings::loss_checks::Course {
             losses: &self.state.history.losses,
             step: self.state.step,
             steps: self.config.steps,

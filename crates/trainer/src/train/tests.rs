@@ -193,11 +193,11 @@ fn a_checkpoint_is_of_one_run() {
     let error = error.build().err().map(|error| error.to_string());
     assert!(error.unwrap().contains("is not used, it was trained on"));
     let mut config = first.run.config.clone();
-    config.rates.sh0 *= 2.0;
+    config.learning_rates.sh0 *= 2.0;
     config.background = Some([1.0; 3]);
     let error = refusal(&|builder| builder.config(config.clone())).unwrap();
     assert!(
-        error.contains("background = absent") && error.contains("rates.sh0"),
+        error.contains("background = absent") && error.contains("learning_rates.sh0"),
         "{error}"
     );
     let error = refusal(&|builder| {

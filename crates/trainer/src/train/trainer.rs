@@ -21,10 +21,10 @@ use super::loss_log::{LossLog, ReadLoss, UnreadLoss, check_finite};
 use super::state::State;
 use super::training_views::CaptureViews;
 use super::{
-    LossTerms, TargetView, TrainConfig, TrainError, TrainerBuilder, Warning, coarse, views,
-    warnings,
+    LossTerms, TargetView, TrainConfig, TrainError, TrainerBuilder, Warning, resolution_schedule,
+    views, warnings,
 };
-use crate::photo::levels;
+use crate::photo::pixels_u8;
 
 /// A training run.
 pub struct Trainer<M: SplatModel = Gaussians> {
@@ -38,7 +38,7 @@ pub struct Trainer<M: SplatModel = Gaussians> {
     pub(super) state: State<M>,
     pub(super) record: RunRecord,
     pub(super) losses: LossLog,
-    pub(super) coarse: coarse::CoarseViews,
+    pub(super) coarse: resolution_schedule::CoarseViews,
 }
 
 impl Trainer {
@@ -69,7 +69,7 @@ impl<M: SplatModel> Trainer<M> {
         let start = Instant::now();
         keep_awake(&self.device);
         self.update()?;
-        let inspects = warnings::course::is_due(self.state.step, self.config.steps);
+        let inspects = warnings::loss_checks::is_due(self.state.step, self.config.steps);
         if self.losses.is_full() || inspects {
             self.read_losses()?;
         }
@@ -138,7 +138,7 @@ impl<M: SplatModel> Trainer<M> {
     ) -> Result<Measured, TrainError> {
         let index = self.capture.split.train[training_index];
         let factor = self.state.strategy.photo_factor(at);
-        let factor = factor.unwrap_or_else(|| coarse::factor(&self.config, at));
+        let factor = factor.unwrap_or_else(|| resolution_schedule::factor(&self.config, at));
         let view = self.coarse.view(&self.capture, index, factor.max(1));
         let model = self.state.model.model();
         let hooks = &self.state.hooks;
@@ -163,8 +163,8 @@ impl<M: SplatModel> Trainer<M> {
         let rendered = render_projected_on(model, &projected, &cameras, background, &settings)?;
         let rendered = hooks.image(&hook_view, rendered)?;
         drop(render);
-        let levels = trace_span!("photo").in_scope(|| levels(&view, &self.device));
-        let target = TargetView::new(&view.name, levels, &cameras, at.step);
+        let pixels = trace_span!("photo").in_scope(|| pixels_u8(&view, &self.device));
+        let target = TargetView::new(&view.name, pixels, &cameras, at.step);
         let evaluated = trace_span!("loss").in_scope(|| self.loss.evaluate(&target, &rendered))?;
         let Some((mut loss, mut terms)) = evaluated else {
             return Err(TrainError::Loss("has no term"));

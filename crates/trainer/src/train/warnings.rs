@@ -3,8 +3,8 @@
 //! A warning stops nothing. Thresholds compare with the other cameras, photos or views, by medians, so that one bad
 //! one stands out and a scene of any size or kind does not.
 
-pub(super) mod course;
-pub(super) mod start;
+pub(super) mod capture_checks;
+pub(super) mod loss_checks;
 
 use std::fmt;
 
@@ -312,11 +312,16 @@ mod tests {
         );
         assert!(text.contains("0.5000") && !text.contains('\n'), "{text}");
         let warning = Warning::HighRates {
-            rates: vec![("rates.means".into(), 10.0), ("rates.sh0".into(), 7.5)],
+            rates: vec![
+                ("learning_rates.means".into(), 10.0),
+                ("learning_rates.sh0".into(), 7.5),
+            ],
         };
         let text = warning.to_string();
         assert!(
-            text.starts_with("rates.means is 10 x its default, rates.sh0 is 7.5 x"),
+            text.starts_with(
+                "learning_rates.means is 10 x its default, learning_rates.sh0 is 7.5 x"
+            ),
             "{text}"
         );
     }

@@ -201,11 +201,11 @@ fn is_noise(view: &View) -> bool {
 
 fn high_rates(config: &TrainConfig) -> Option<Warning> {
     let rates: Vec<(String, f64)> = config
-        .rates
+        .learning_rates
         .factors()
         .into_iter()
         .filter(|(_, factor)| *factor >= HIGH_RATE)
-        .map(|(name, factor)| (format!("rates.{name}"), factor))
+        .map(|(name, factor)| (format!("learning_rates.{name}"), factor))
         .collect();
     (!rates.is_empty()).then_some(Warning::HighRates { rates })
 }
