@@ -39,6 +39,7 @@ mod inputs;
 mod judge;
 mod ladder;
 mod line;
+mod noise;
 mod outputs;
 mod report;
 mod search;

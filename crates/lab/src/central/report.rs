@@ -169,6 +169,10 @@ impl Report {
                 "`{name}` {place}: a kink, slopes {left:e} on the left and {right:e} on the right; analytic {analytic:e} is \
                  accepted"
             ),
+            Kind::Kink { left, right, .. } if c.at.is_none() => format!(
+                "`{name}` {place}: more kinks than are looked for, slopes {left:e} and {right:e} along it. Choose another \
+                 point, or a smaller input"
+            ),
             Kind::Kink { left, right, .. } => format!(
                 "`{name}` {place}: a kink, slopes {left:e} on the left and {right:e} on the right; analytic {analytic:e} is \
                  refused: it lies outside of them, or kinks are refused. Choose another point or correct the backward pass"
