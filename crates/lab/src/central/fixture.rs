@@ -205,13 +205,7 @@ impl Fixture {
         {
             rows.push(match expected {
                 Some(expected) => self.row(&format!("grad.{name}"), ours.as_ref(), expected),
-                None => Row {
-                    name: name.into(),
-                    shape: array.shape.clone(),
-                    coverage: Coverage::Constant,
-                    worst: None,
-                    findings: Vec::new(),
-                },
+                None => Row::constant(name, &array.shape),
             });
         }
         Ok(Report {
@@ -252,6 +246,7 @@ impl Fixture {
             shape: expected.shape.clone(),
             coverage: Coverage::Elements(values.len()),
             worst: worst.map(|(_, comparison)| comparison),
+            all_zero: values.iter().chain(&expected.values).all(|x| *x == 0.0),
             findings: finding
                 .map(|(_, comparison)| Finding { kind, comparison })
                 .into_iter()

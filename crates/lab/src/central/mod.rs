@@ -152,13 +152,7 @@ fn check(
     let mut rows = Vec::new();
     for (i, (name, array)) in inputs.iter().enumerate() {
         if !tracked[i] {
-            rows.push(Row {
-                name: name.into(),
-                shape: array.shape.clone(),
-                coverage: Coverage::Constant,
-                worst: None,
-                findings: Vec::new(),
-            });
+            rows.push(Row::constant(name, &array.shape));
             continue;
         }
         let search = Search {

@@ -81,6 +81,7 @@ impl Search<'_, '_> {
             shape: self.shape.to_vec(),
             coverage: Coverage::Elements(self.values.len()),
             worst: None,
+            all_zero: true,
             findings: Vec::new(),
         };
         if self.values.len() <= self.settings.each_up_to {
@@ -99,6 +100,7 @@ impl Search<'_, '_> {
         for i in 0..sizes.len() {
             let followed = self.follow(i..i + 1, sizes, known)?;
             let comparison = self.comparison(&followed, Some(i), sizes[i]);
+            row.all_zero &= comparison.is_zero();
             let severity = followed.severity(self.settings);
             if severity > most_severe {
                 most_severe = severity;
@@ -132,16 +134,17 @@ impl Search<'_, '_> {
             }
             loop {
                 let followed = self.follow(0..n, &moves, known)?;
+                let whole = self.comparison(&followed, None, 1.0);
+                row.all_zero &= whole.is_zero();
                 let Some(kind) = followed.kind else {
                     limit = self.limit(&followed).min(limit);
                     let severity = followed.severity(self.settings);
                     if severity > most_severe && row.is_ok() {
                         most_severe = severity;
-                        row.worst = Some(self.comparison(&followed, None, 1.0));
+                        row.worst = Some(whole);
                     }
                     break;
                 };
-                let whole = self.comparison(&followed, None, 1.0);
                 let finding = match self.narrow(&moves, known)? {
                     Some((i, finding)) if found.len() < MOST_BY_HALVING => {
                         found.push(i);

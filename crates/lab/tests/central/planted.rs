@@ -89,6 +89,23 @@ fn a_detached_input() {
     );
 }
 
+/// Behind a dead ReLU nothing tells a detached input from another. The report says that all is zero.
+#[test]
+fn an_input_without_influence_is_named() {
+    for elements in [0, 1000] {
+        let report = gradcheck_with(
+            |(x, y)| activation::relu(x.detach() - 10.0) + y,
+            (("x", random(13, [3])), ("y", random(14, [3]))),
+            &Settings::new().with_each_up_to(elements),
+        )
+        .unwrap();
+        report.expect();
+        assert!(report.row("x").unwrap().all_zero, "{report}");
+        assert!(!report.row("y").unwrap().all_zero, "{report}");
+        assert!(report.to_string().contains("ok, all zero"), "{report}");
+    }
+}
+
 #[test]
 fn everything_detached() {
     let report = gradcheck(|x| x.detach().exp(), ("x", random(8, [3]))).unwrap();
