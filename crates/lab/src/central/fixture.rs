@@ -10,7 +10,7 @@ use super::function::{Closure, Function};
 use super::inputs::{Inputs, NamedTensors};
 use super::outputs::Outputs;
 use super::report::{Comparison, Coverage, Finding, Kind, Report, Row};
-use crate::gradcheck::{Array, index_of};
+use crate::gradcheck::{Array, check_unique_names, index_of};
 
 /// Relative difference of an element that passes, to the larger of itself and the root mean square of its tensor.
 const TOLERANCE: f64 = 1e-9;
@@ -88,7 +88,8 @@ impl Fixture {
     fn parse(file: &Path) -> Result<Self, String> {
         let bytes = std::fs::read(file).map_err(|error| error.to_string())?;
         let format = |error| format!("not a safetensors file: {error}");
-        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(format)?;
+        let (length, header) = SafeTensors::read_metadata(&bytes).map_err(format)?;
+        check_unique_names(&bytes, length)?;
         let tensors = SafeTensors::deserialize(&bytes).map_err(format)?;
         let order = header.metadata().as_ref().and_then(|m| m.get("outputs"));
         let order: Vec<&str> = match order {
@@ -204,13 +205,7 @@ impl Fixture {
         {
             rows.push(match expected {
                 Some(expected) => self.row(&format!("grad.{name}"), ours.as_ref(), expected),
-                None => Row {
-                    name: name.into(),
-                    shape: array.shape.clone(),
-                    coverage: Coverage::Constant,
-                    worst: None,
-                    findings: Vec::new(),
-                },
+                None => Row::constant(name, &array.shape),
             });
         }
         Ok(Report {
@@ -251,6 +246,7 @@ impl Fixture {
             shape: expected.shape.clone(),
             coverage: Coverage::Elements(values.len()),
             worst: worst.map(|(_, comparison)| comparison),
+            all_zero: values.iter().chain(&expected.values).all(|x| *x == 0.0),
             findings: finding
                 .map(|(_, comparison)| Finding { kind, comparison })
                 .into_iter()

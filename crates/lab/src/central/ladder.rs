@@ -4,9 +4,11 @@
 //! and of all values in its tableau the one with the smallest estimated error is kept (Ridders 1982). Large steps are exact
 //! for smooth functions; small ones are what is left where a kink is near.
 
+use super::noise::{Extent, Noise};
+
 /// Steps tried at most. The last is 2^-20 of the first.
-const LEVELS: usize = 11;
-const RATIO: f64 = 4.0;
+pub(super) const LEVELS: usize = 11;
+pub(super) const RATIO: f64 = 4.0;
 /// Rows of the tableau before it may be trusted.
 const LEAST: usize = 3;
 
@@ -24,12 +26,8 @@ pub(super) struct Sample {
     pub central: f64,
     /// `(f(h) - 2 f(0) + f(-h)) / h`: the slope on the right minus that on the left.
     pub jump: f64,
-    /// What rounding makes of `central`.
-    pub noise: f64,
-    /// Size of the values that changed: the root of the sum of their squares, weighted.
-    pub size: f64,
-    /// The same of their weights alone.
-    pub weight: f64,
+    /// What changed.
+    pub extent: Extent,
 }
 
 /// The derivative along a line.
@@ -53,13 +51,14 @@ pub(super) struct Enough {
 /// in a row can be used: `sample` says so by `None`.
 pub(super) fn climb_down<E>(
     first: f64,
+    noise: Noise,
     enough: Enough,
     mut sample: impl FnMut(f64) -> Result<Option<Sample>, E>,
 ) -> Result<Option<Slope>, E> {
     // Even powers of the step in the one, odd ones in the other.
     let mut central = Tableau::new(RATIO * RATIO);
     let mut jump = Tableau::new(RATIO);
-    let mut size: f64 = 0.0;
+    let mut extent = Extent::default();
     let mut step = first;
     for _ in 0..LEVELS {
         match sample(step)? {
@@ -68,9 +67,10 @@ pub(super) fn climb_down<E>(
                 jump.restart();
             }
             Some(at) => {
-                central.push(at.central, at.noise);
-                jump.push(at.jump, 4.0 * at.noise);
-                size = size.max(at.size);
+                extent = extent.or(at.extent);
+                let noise = noise.of(extent) / step;
+                central.push(at.central, noise);
+                jump.push(at.jump, 4.0 * noise);
                 let done = central.is_within(enough.central)
                     && jump.is_within(enough.jump)
                     && jump.best.value.abs() <= enough.jump.max(4.0 * jump.best.error);
@@ -85,28 +85,8 @@ pub(super) fn climb_down<E>(
     Ok(found.then_some(Slope {
         central: central.best,
         jump: jump.best,
-        size,
+        size: extent.size,
     }))
-}
-
-/// What rounding makes of differences at a step of one, from those at the smallest steps: `|change of the difference| * step`,
-/// at most.
-pub(super) fn noise_at_the_bottom<E>(
-    first: f64,
-    mut sample: impl FnMut(f64) -> Result<Option<Sample>, E>,
-) -> Result<Option<f64>, E> {
-    let last = first / RATIO.powi(LEVELS as i32 - 1);
-    let (mut noise, mut before): (Option<f64>, Option<f64>) = (None, None);
-    for factor in [RATIO * RATIO, RATIO, 1.0] {
-        let step = last * factor;
-        let central = sample(step)?.map(|at| at.central);
-        if let (Some(before), Some(central)) = (before, central) {
-            let change = (central - before).abs() * step;
-            noise = Some(noise.map_or(change, |noise| noise.max(change)));
-        }
-        before = central;
-    }
-    Ok(noise)
 }
 
 /// The rows of Richardson's extrapolation, of which the last is kept.
@@ -181,15 +161,16 @@ mod tests {
             central: 1e-12,
             jump: 1e-9,
         };
-        climb_down(1.0 / 64.0, enough, |h| {
+        climb_down(1.0 / 64.0, Noise::LEAST, enough, |h| {
             let (right, middle, left) = (f(h), f(0.0), f(-h));
             let usable = (right + left).is_finite();
             Ok::<_, std::convert::Infallible>(usable.then(|| Sample {
                 central: (right - left) / (2.0 * h),
                 jump: (right - 2.0 * middle + left) / h,
-                noise: f64::EPSILON * middle.abs() / h,
-                size: middle.abs(),
-                weight: 1.0,
+                extent: Extent {
+                    size: middle.abs(),
+                    weight: 1.0,
+                },
             }))
         })
         .unwrap()

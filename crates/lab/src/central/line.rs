@@ -6,47 +6,7 @@ use super::CheckError;
 use super::function::Function;
 use super::inputs::Inputs;
 use super::ladder::Sample;
-
-/// What rounding makes of one output's element.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) struct Noise {
-    /// As a multiple of what rounding the element itself makes.
-    pub factor: f64,
-    /// Beside that, whatever the element's size.
-    pub floor: f64,
-}
-
-impl Noise {
-    /// That of a function which is exact but for its last rounding.
-    pub(super) const LEAST: Self = Self {
-        factor: 1.0,
-        floor: 0.0,
-    };
-
-    /// Of differences along one line, at a step of one.
-    pub(super) fn of(self, at: &Sample) -> f64 {
-        ROUNDING * self.factor * at.size + self.floor * at.weight
-    }
-
-    /// What explains that differences along a line are off by `found`, at a step of one.
-    pub(super) fn that_explains(found: f64, at: &Sample) -> Self {
-        let factor = found / (ROUNDING * at.size);
-        if factor <= 4.0 {
-            return Self {
-                factor: factor.max(1.0),
-                floor: 0.0,
-            };
-        }
-        // Rounding inside of the function: in proportion to the outputs, or the same for all.
-        Self {
-            factor,
-            floor: found / at.weight,
-        }
-    }
-}
-
-/// Rounding of two values, halved by the two steps between them.
-const ROUNDING: f64 = 0.5 * f64::EPSILON;
+use super::noise::Extent;
 
 /// Moves of some elements of one input.
 #[derive(Debug, Clone)]
@@ -88,12 +48,7 @@ impl<'a> Probe<'a> {
     }
 
     /// Differences at one step. `None` where an output is not finite.
-    pub(super) fn sample(
-        &mut self,
-        line: &Line,
-        step: f64,
-        noise: Noise,
-    ) -> Result<Option<Sample>, CheckError> {
+    pub(super) fn sample(&mut self, line: &Line, step: f64) -> Result<Option<Sample>, CheckError> {
         let right = self.at(line, step)?;
         let left = self.at(line, -step)?;
         let (mut central, mut jump, mut size, mut weights) = (0.0, 0.0, 0.0, 0.0);
@@ -112,15 +67,14 @@ impl<'a> Probe<'a> {
             size += (weight * largest).powi(2);
             weights += weight * weight;
         }
-        let mut sample = Sample {
+        Ok(Some(Sample {
             central: central / (2.0 * step),
             jump: jump / step,
-            noise: 0.0,
-            size: f64::sqrt(size),
-            weight: f64::sqrt(weights),
-        };
-        sample.noise = noise.of(&sample) / step;
-        Ok(Some(sample))
+            extent: Extent {
+                size: f64::sqrt(size),
+                weight: f64::sqrt(weights),
+            },
+        }))
     }
 
     /// Outputs after the moves, `step` times.

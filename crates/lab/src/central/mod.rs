@@ -39,6 +39,7 @@ mod inputs;
 mod judge;
 mod ladder;
 mod line;
+mod noise;
 mod outputs;
 mod report;
 mod search;
@@ -151,13 +152,7 @@ fn check(
     let mut rows = Vec::new();
     for (i, (name, array)) in inputs.iter().enumerate() {
         if !tracked[i] {
-            rows.push(Row {
-                name: name.into(),
-                shape: array.shape.clone(),
-                coverage: Coverage::Constant,
-                worst: None,
-                findings: Vec::new(),
-            });
+            rows.push(Row::constant(name, &array.shape));
             continue;
         }
         let search = Search {

@@ -24,6 +24,9 @@ pub struct Row {
     pub coverage: Coverage,
     /// The comparison that came closest to failing, or failed most; `None` where nothing was compared.
     pub worst: Option<Comparison>,
+    /// Whether every derivative is exactly zero, on both sides: the function does not depend on this input at this point, so
+    /// that not much was checked.
+    pub all_zero: bool,
     /// What is wrong, and kinks. No more than eight; then there may be more.
     pub findings: Vec<Finding>,
 }
@@ -169,6 +172,10 @@ impl Report {
                 "`{name}` {place}: a kink, slopes {left:e} on the left and {right:e} on the right; analytic {analytic:e} is \
                  accepted"
             ),
+            Kind::Kink { left, right, .. } if c.at.is_none() => format!(
+                "`{name}` {place}: more kinks than are looked for, slopes {left:e} and {right:e} along it. Choose another \
+                 point, or a smaller input"
+            ),
             Kind::Kink { left, right, .. } => format!(
                 "`{name}` {place}: a kink, slopes {left:e} on the left and {right:e} on the right; analytic {analytic:e} is \
                  refused: it lies outside of them, or kinks are refused. Choose another point or correct the backward pass"
@@ -186,6 +193,11 @@ impl Report {
 }
 
 impl Comparison {
+    /// Whether both derivatives are exactly zero.
+    pub(super) fn is_zero(&self) -> bool {
+        self.analytic == 0.0 && self.numeric == 0.0
+    }
+
     /// The difference relative to the larger of both; 0 where they are equal.
     pub fn relative(&self) -> f64 {
         let difference = (self.analytic - self.numeric).abs();
@@ -205,6 +217,18 @@ impl Comparison {
 }
 
 impl Row {
+    /// That of an input which is not looked at.
+    pub(super) fn constant(name: &str, shape: &[usize]) -> Self {
+        Self {
+            name: name.into(),
+            shape: shape.to_vec(),
+            coverage: Coverage::Constant,
+            worst: None,
+            all_zero: false,
+            findings: Vec::new(),
+        }
+    }
+
     /// Whether no finding of it fails.
     pub fn is_ok(&self) -> bool {
         !self.findings.iter().any(|finding| finding.kind.fails())
@@ -213,6 +237,7 @@ impl Row {
     fn verdict(&self) -> &'static str {
         let first = self.findings.iter().find(|f| f.kind.fails());
         match first.or(self.findings.first()).map(|finding| finding.kind) {
+            None if self.all_zero => "ok, all zero",
             None => "ok",
             Some(Kind::Wrong) => "WRONG",
             Some(Kind::NoGradient) => "NO GRADIENT",

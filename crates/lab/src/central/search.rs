@@ -9,8 +9,9 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use super::judge::Analytic;
-use super::ladder::{Slope, climb_down, noise_at_the_bottom};
-use super::line::{Line, Noise, Probe, sizes};
+use super::ladder::{Slope, climb_down};
+use super::line::{Line, Probe, sizes};
+use super::noise::{Extent, Noise, noise_at_the_bottom};
 use super::report::{Comparison, Coverage, Finding, Kind, Row};
 use super::{CheckError, Settings};
 use crate::gradcheck::index_of;
@@ -80,6 +81,7 @@ impl Search<'_, '_> {
             shape: self.shape.to_vec(),
             coverage: Coverage::Elements(self.values.len()),
             worst: None,
+            all_zero: true,
             findings: Vec::new(),
         };
         if self.values.len() <= self.settings.each_up_to {
@@ -98,6 +100,7 @@ impl Search<'_, '_> {
         for i in 0..sizes.len() {
             let followed = self.follow(i..i + 1, sizes, known)?;
             let comparison = self.comparison(&followed, Some(i), sizes[i]);
+            row.all_zero &= comparison.is_zero();
             let severity = followed.severity(self.settings);
             if severity > most_severe {
                 most_severe = severity;
@@ -131,16 +134,17 @@ impl Search<'_, '_> {
             }
             loop {
                 let followed = self.follow(0..n, &moves, known)?;
+                let whole = self.comparison(&followed, None, 1.0);
+                row.all_zero &= whole.is_zero();
                 let Some(kind) = followed.kind else {
                     limit = self.limit(&followed).min(limit);
                     let severity = followed.severity(self.settings);
                     if severity > most_severe && row.is_ok() {
                         most_severe = severity;
-                        row.worst = Some(self.comparison(&followed, None, 1.0));
+                        row.worst = Some(whole);
                     }
                     break;
                 };
-                let whole = self.comparison(&followed, None, 1.0);
                 let finding = match self.narrow(&moves, known)? {
                     Some((i, finding)) if found.len() < MOST_BY_HALVING => {
                         found.push(i);
@@ -149,10 +153,7 @@ impl Search<'_, '_> {
                     }
                     // No element by itself explains it, or there are too many.
                     _ => Finding {
-                        kind: match kind {
-                            Kind::Kink { .. } => Kind::Unresolved,
-                            kind => kind,
-                        },
+                        kind: refused(kind),
                         comparison: whole,
                     },
                 };
@@ -229,15 +230,16 @@ impl Search<'_, '_> {
                 range: 0..sizes.len(),
                 moves: &moves,
             };
-            let mut last = None;
+            let mut extent = Extent::default();
             let found = noise_at_the_bottom(self.settings.step, |step| {
-                last = self.probe.sample(&line, step, Noise::LEAST)?;
-                Ok::<_, CheckError>(last)
+                let sample = self.probe.sample(&line, step)?;
+                extent = sample.map_or(extent, |sample| extent.or(sample.extent));
+                Ok::<_, CheckError>(sample)
             })?;
-            let (Some(found), Some(last)) = (found, last.filter(|last| last.size > 0.0)) else {
+            let Some(found) = found.filter(|_| extent.size > 0.0) else {
                 continue;
             };
-            let noise = Noise::that_explains(found, &last);
+            let noise = Noise::that_explains(found, extent);
             if least.is_none_or(|least| noise.factor < least.factor) {
                 least = Some(noise);
             }
@@ -261,8 +263,8 @@ impl Search<'_, '_> {
             moves,
         };
         let enough = analytic.enough(self.settings);
-        let slope = climb_down(self.settings.step, enough, |step| {
-            self.probe.sample(&line, step, known.noise)
+        let slope = climb_down(self.settings.step, known.noise, enough, |step| {
+            self.probe.sample(&line, step)
         })?;
         let kind = analytic.judge(slope.as_ref(), self.settings);
         Ok(Followed {
@@ -312,6 +314,18 @@ impl Search<'_, '_> {
             numeric: numeric / size,
             error: error / size,
         }
+    }
+}
+
+/// The same kind, and no accepted kink: what else there is was not looked for.
+fn refused(kind: Kind) -> Kind {
+    match kind {
+        Kind::Kink { left, right, .. } => Kind::Kink {
+            left,
+            right,
+            accepted: false,
+        },
+        kind => kind,
     }
 }
 

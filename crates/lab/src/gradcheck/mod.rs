@@ -28,6 +28,8 @@ pub use fixture::Fixture;
 #[doc(hidden)]
 pub use fixture::KEYS as FIXTURE_KEYS;
 #[cfg(feature = "cpu")]
+pub(crate) use fixture::unique::check as check_unique_names;
+#[cfg(feature = "cpu")]
 pub(crate) use judge::relative_l2;
 pub use judge::{FileReport, GroupReport, OutputReport, compare, gate};
 pub use report::{json, table};

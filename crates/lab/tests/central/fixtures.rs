@@ -125,6 +125,10 @@ fn files_that_do_not_fit_are_refused() {
             r#"{"__metadata__":{"outputs":"y"},"y":{"dtype":"F64","shape":[1],"data_offsets":[0,8]}}"#,
             "tensor `grad_y` is missing",
         ),
+        (
+            r#"{"__metadata__":{"outputs":"y"},"y":{"dtype":"F64","shape":[1],"data_offsets":[0,8]},"y":{"dtype":"F64","shape":[1],"data_offsets":[0,8]}}"#,
+            "`y` occurs twice",
+        ),
         ("[]", "not a safetensors file"),
     ];
     for (header, reason) in cases {

@@ -10,7 +10,6 @@ default settings, in the fast mode for the million elements, whose full Jacobian
 
 import json
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -117,9 +116,8 @@ def jacobian_errors(function, inputs):
 def verdict(name, function, inputs):
     leaves = tuple(x.clone().requires_grad_() for x in inputs.values())
     fast = name == "one_in_a_million"
-    start = time.time()
     result = torch.autograd.gradcheck(function, leaves, raise_exception=False, fast_mode=fast)
-    entry = {"passes": bool(result), "fast_mode": fast, "seconds": round(time.time() - start, 1)}
+    entry = {"passes": bool(result), "fast_mode": fast}
     if not fast:
         entry["worst_error"] = jacobian_errors(function, inputs)
     return entry

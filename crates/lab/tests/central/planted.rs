@@ -3,7 +3,7 @@
 use burn::tensor::activation;
 use splat_lab::central::{Kind, Settings, gradcheck, gradcheck_with, tensor};
 
-use super::{assert_wrong, only, random};
+use super::{assert_wrong, numbers, only, random};
 
 /// Of one element out of twelve, to one part in 100,000.
 #[test]
@@ -87,6 +87,23 @@ fn a_detached_input() {
         message.starts_with("`b` at [0, 0]: no gradient"),
         "{message}"
     );
+}
+
+/// Behind a dead ReLU nothing tells a detached input from another. The report says that all is zero.
+#[test]
+fn an_input_without_influence_is_named() {
+    for elements in [0, 1000] {
+        let report = gradcheck_with(
+            |(x, y)| activation::relu(x.detach() - 10.0) + y,
+            (("x", random(13, [3])), ("y", random(14, [3]))),
+            &Settings::new().with_each_up_to(elements),
+        )
+        .unwrap();
+        report.expect();
+        assert!(report.row("x").unwrap().all_zero, "{report}");
+        assert!(!report.row("y").unwrap().all_zero, "{report}");
+        assert!(report.to_string().contains("ok, all zero"), "{report}");
+    }
 }
 
 #[test]
@@ -208,4 +225,18 @@ fn a_bug_in_the_second_output() {
     )
     .unwrap();
     assert!(!report.is_ok(), "{report}");
+}
+
+/// In a large input kinks are looked for one after the other. Ten are too many, and what they may hide is not passed.
+#[test]
+fn too_many_kinks_in_a_large_input() {
+    let mut values = numbers(12, 2000);
+    values[100..110].fill(0.0);
+    let report = gradcheck(activation::relu, ("x", tensor(values, [2000]))).unwrap();
+    assert!(!report.is_ok(), "{report}");
+    let message = report.check().unwrap_err().to_string();
+    assert!(
+        message.contains("more kinks than are looked for"),
+        "{message}"
+    );
 }

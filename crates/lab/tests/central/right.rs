@@ -91,6 +91,37 @@ fn many_seeds() {
     }
 }
 
+/// Inputs of all sizes, some of them where most of the gradient vanishes and only rounding is left.
+#[test]
+fn no_false_alarms() {
+    let functions: [(&str, &dyn Fn(Tensor<2>) -> Tensor<2>); 7] = [
+        ("softmax", &|x| activation::softmax(x, 1)),
+        ("relu", &activation::relu),
+        ("norm", &|x| x.square().sum_dim(1).sqrt()),
+        ("gram", &|x| x.clone().transpose().matmul(x)),
+        ("log of length", &|x| x.abs().log()),
+        ("peak", &|x| (x.square() + 1e-4).recip()),
+        ("noisy", &|x| (x.sin() + 1e5) - 1e5),
+    ];
+    for (name, function) in functions {
+        for seed in 0..120 {
+            let scale = [1.0, 1e-3, 30.0][seed as usize % 3];
+            if name == "noisy" && scale != 1.0 {
+                continue;
+            }
+            let settings = Settings::new()
+                .with_seed(seed)
+                .with_each_up_to(1000 * (seed as usize % 2));
+            let x = random(seed, [4, 6]) * scale;
+            let report = gradcheck_with(function, ("x", x), &settings).unwrap();
+            assert!(
+                report.is_ok(),
+                "{name}, seed {seed}, times {scale}\n{report}"
+            );
+        }
+    }
+}
+
 const SIZE: ImageSize = ImageSize {
     width: 12,
     height: 10,

@@ -1,0 +1,83 @@
+//! What rounding makes of differences.
+
+use super::ladder::{LEVELS, RATIO, Sample};
+
+/// Rounding of two values, halved by the two steps between them.
+const ROUNDING: f64 = 0.5 * f64::EPSILON;
+
+/// The outputs that change along a line.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub(super) struct Extent {
+    /// Root of the sum of their squares, weighted.
+    pub size: f64,
+    /// The same of their weights alone.
+    pub weight: f64,
+}
+
+impl Extent {
+    /// Both. An output that changes at a large step is rounded at a small one too, where it may not seem to change.
+    pub(super) fn or(self, other: Self) -> Self {
+        Self {
+            size: self.size.max(other.size),
+            weight: self.weight.max(other.weight),
+        }
+    }
+}
+
+/// What rounding makes of one output's element.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Noise {
+    /// As a multiple of what rounding the element itself makes.
+    pub factor: f64,
+    /// Beside that, whatever the element's size.
+    pub floor: f64,
+}
+
+impl Noise {
+    /// That of a function which is exact but for its last rounding.
+    pub(super) const LEAST: Self = Self {
+        factor: 1.0,
+        floor: 0.0,
+    };
+
+    /// Of differences along one line, at a step of one.
+    pub(super) fn of(self, extent: Extent) -> f64 {
+        ROUNDING * self.factor * extent.size + self.floor * extent.weight
+    }
+
+    /// What explains that differences along a line are off by `found`, at a step of one.
+    pub(super) fn that_explains(found: f64, at: Extent) -> Self {
+        let factor = found / (ROUNDING * at.size);
+        if factor <= 4.0 {
+            return Self {
+                factor: factor.max(1.0),
+                floor: 0.0,
+            };
+        }
+        // Rounding inside of the function: in proportion to the outputs, or the same for all.
+        Self {
+            factor,
+            floor: found / at.weight,
+        }
+    }
+}
+
+/// What rounding makes of differences at a step of one, from those at the smallest steps: `|change of the difference| * step`,
+/// at most.
+pub(super) fn noise_at_the_bottom<E>(
+    first: f64,
+    mut sample: impl FnMut(f64) -> Result<Option<Sample>, E>,
+) -> Result<Option<f64>, E> {
+    let last = first / RATIO.powi(LEVELS as i32 - 1);
+    let (mut noise, mut before): (Option<f64>, Option<f64>) = (None, None);
+    for factor in [RATIO * RATIO, RATIO, 1.0] {
+        let step = last * factor;
+        let central = sample(step)?.map(|at| at.central);
+        if let (Some(before), Some(central)) = (before, central) {
+            let change = (central - before).abs() * step;
+            noise = Some(noise.map_or(change, |noise| noise.max(change)));
+        }
+        before = central;
+    }
+    Ok(noise)
+}
