@@ -78,7 +78,7 @@ pub struct Evaluations {
     pub blended: u64,
 }
 
-/// Counts the evaluations of [`rasterize`] by rendering once more; a measurement, which waits for the device.
+/// Counts the evaluations of [`rasterize`](super::rasterize) by rendering once more; a measurement, which waits for the device.
 ///
 /// # Errors
 /// The device's error, in words.
