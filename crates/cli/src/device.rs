@@ -2,7 +2,7 @@
 
 use burn::tensor::Device;
 use clap::ValueEnum;
-use splat_ops::device::describe;
+use splat_ops::device::device_info;
 
 use super::{Failure, GlobalArgs};
 
@@ -44,7 +44,7 @@ pub(super) struct ChosenDevice {
 impl ChosenDevice {
     /// Its name, and of a CubeCL device what decides which variants of the kernels run, and which these are.
     fn in_words(&self) -> String {
-        let facts = describe(&self.device).unwrap_or_default();
+        let facts = device_info(&self.device).unwrap_or_default();
         let told = ["runtime", "planes", "atomic addition", "rasterize", "sort"];
         let facts = facts.iter().filter(|(name, _)| told.contains(name));
         let facts = facts.map(|(name, value)| format!("; {name}: {value}"));
@@ -64,7 +64,7 @@ pub(super) fn open(global: &GlobalArgs) -> Result<ChosenDevice, Failure> {
             .or_else(|()| cpu().or_else(|_| wgpu("wgpu"))),
     }?;
     global.say(format_args!("device: {}", chosen.in_words()));
-    let facts = describe(&chosen.device).unwrap_or_default();
+    let facts = device_info(&chosen.device).unwrap_or_default();
     if may_crash(&facts) {
         global.say(
             "warning: this program gives SPIR-V to Vulkan (feature `vulkan`), on which older software Vulkan (llvmpipe \

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use splat_ops::device::describe;
+use splat_ops::device::device_info;
 
 use super::input::CaptureArgs;
 use super::{Failure, GlobalArgs, chosen, print, write_svg};
@@ -36,7 +36,7 @@ pub(super) struct StepArgs {
 /// Runs the command.
 pub(super) fn run(args: &StepArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let device = chosen(global)?;
-    let on_device = describe(&device).is_some();
+    let on_device = device_info(&device).is_some();
     if on_device && args.svg.is_some() {
         return Err(Failure::BadInput(
             "--svg: the picture of a step is drawn for the CPU only; leave it out, or --device"

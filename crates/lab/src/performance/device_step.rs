@@ -7,7 +7,7 @@ use std::time::Instant;
 
 use burn::tensor::Device;
 use serde::Serialize;
-use splat_ops::device::{StepSizes, copy_bandwidth, describe, kernel_work, step_floor};
+use splat_ops::device::{StepSizes, copy_bandwidth, device_info, kernel_work, step_floor};
 
 use super::device_memory::{
     DeviceMemory, PER_GAUSSIAN_AT_REST, PER_GAUSSIAN_GOAL, in_use, parameters,
@@ -102,7 +102,7 @@ pub fn measure(
     seconds: f64,
     mut say: impl FnMut(&str),
 ) -> Result<DeviceStepReport, PerformanceError> {
-    let facts = describe(device).ok_or(PerformanceError::NotCubeCl)?;
+    let facts = device_info(device).ok_or(PerformanceError::NotCubeCl)?;
     say("copying, for the device's memory bandwidth");
     let software = is_software(device);
     let bytes = if software {
@@ -194,7 +194,7 @@ pub(super) fn run(
         in_a_row,
         launches: per_step(done.launches),
         waits: per_step(done.waits),
-        instances: per_step(done.instances),
+        instances: per_step(done.intersections),
         reserved_bytes: per_step(done.reserved_bytes),
         staged,
         memory,
@@ -214,7 +214,7 @@ impl DeviceRun {
         let sizes = StepSizes {
             gaussians: work.gaussians as u64,
             visible: work.visible as u64,
-            instances: self.instances as u64,
+            intersections: self.instances as u64,
             width: u64::from(width),
             height: u64::from(height),
             sh_degree,

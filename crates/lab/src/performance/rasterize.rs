@@ -10,7 +10,7 @@ use splat_data::SplatData;
 use splat_model::{CameraTensors, Gaussians, RenderSettings, render};
 use splat_ops::RasterizeSettings;
 use splat_ops::cpu::InstructionSet;
-use splat_ops::device::describe;
+use splat_ops::device::device_info;
 
 use super::arithmetic::{self, Arithmetic};
 use super::device_step::write_device;
@@ -157,7 +157,7 @@ pub fn measure(
         settings,
         device,
     )?;
-    let facts = describe(device);
+    let facts = device_info(device);
     let mut rows = vec![];
     let runs: Vec<_> = match facts {
         Some(_) => vec![(1, None)],
@@ -272,7 +272,7 @@ fn passes(
     device: &Device,
     seconds: f64,
 ) -> Result<Vec<Pass>, PerformanceError> {
-    let waited_for = describe(device).is_some().then(|| device.clone());
+    let waited_for = device_info(device).is_some().then(|| device.clone());
     let unordered = waited_for.as_ref().map(|_| RenderSettings {
         rasterize: RasterizeSettings {
             deterministic: false,

@@ -58,7 +58,7 @@ impl Work {
             let counted =
                 rasterize_work(&projected, colors.clone(), opacities, &settings.rasterize)?;
             work.visible += share * visible.into_scalar::<i64>() as f64;
-            work.instances += share * counted.instances as f64;
+            work.instances += share * counted.intersections as f64;
             work.pixels += share * f64::from(view.width) * f64::from(view.height);
             work.tested += share * counted.tested as f64;
             work.seen += share * counted.seen as f64;

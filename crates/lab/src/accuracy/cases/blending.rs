@@ -428,7 +428,7 @@ fn too_many_pairs(device: &Device) -> Result<Outcome, AccuracyError> {
     let outcome = Outcome::new();
     Ok(
         match rasterize(&projected, column(0.5, 1), opacities, None, &settings) {
-            Err(error @ splat_ops::OpError::TooManyPairs { .. }) => {
+            Err(error @ splat_ops::OpError::TooManyIntersections { .. }) => {
                 outcome.note(format!("refused: {error}"))
             }
             Err(error) => outcome.demand(false, format!("another error: {error}")),

@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
-use splat_ops::device::describe;
+use splat_ops::device::device_info;
 
 pub use fit::{MemoryFit, steepest};
 pub use scene::{PhotoSize, synthetic_capture};
@@ -86,7 +86,7 @@ pub fn measure_point(
 ) -> Result<Point, PerformanceError> {
     let capture = Arc::new(synthetic_capture(gaussians, size));
     let config = at_degree(&TrainConfig::default(), 3);
-    if describe(device).is_some() {
+    if device_info(device).is_some() {
         let run = device_step::run(&capture, &config, device, WARM_UP, DEVICE_SECONDS)?;
         return Ok(Point {
             work: work_on(&capture, &config, device)?,
@@ -134,7 +134,7 @@ impl ScalingReport {
         }
         Ok(Self {
             machine: Machine::here(),
-            device: describe(device),
+            device: device_info(device),
             memory: MemoryFit::of(&points),
             points,
         })
