@@ -50,7 +50,7 @@ fn more_splats_per_tile_than_memory_holds_are_refused_in_one_line() {
         .find(|line| line.starts_with("error: rasterize:"));
     let line = line.unwrap_or_else(|| panic!("{message}"));
     // 60,000 splats in each of 40 x 30 tiles.
-    assert!(line.contains("72000000 pairs"), "{line}");
+    assert!(line.contains("72000000 intersections"), "{line}");
     assert!(
         line.contains("1.7 GB of memory") && line.contains("can be had"),
         "{line}"

@@ -11,6 +11,9 @@
 //! CubeCL device (feature `wgpu`, `vulkan`, `cuda`) and native Rust for Burn's Flex backend
 //! (feature `cpu`; f32, and f64 as the reference).
 //!
+//! Every op and every gradient runs in a `tracing` span of its name, level trace, on the caller's thread: one load and a
+//! branch where nobody listens.
+//!
 //! # Conventions
 //! - World and camera are right-handed; camera axes are +x right, +y down, +z forward (OpenCV,
 //!   COLMAP). `viewmat` is world-to-camera, row-major 4x4.

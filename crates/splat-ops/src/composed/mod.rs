@@ -3,6 +3,10 @@
 
 mod activation;
 mod photometric;
+#[cfg(feature = "cpu")]
+mod ssim;
 
 pub(crate) use activation::*;
 pub(crate) use photometric::*;
+#[cfg(feature = "cpu")]
+pub(crate) use ssim::*;
