@@ -1,9 +1,10 @@
 //! Differentiable Gaussian splatting for the [Burn](https://burn.dev) tensor framework.
 //!
-//! The only dependency that a crate needs: Burn itself is re-exported, and the [`prelude`] has what most programs use.
-//! [`ops`] are the differentiable ops (tensors in, tensors out), [`model`] the Gaussians, cameras, losses, strategies and
-//! optimisers, [`data`] captures and scene files, [`train`] the training loop and evaluation, and with the feature `lab`
-//! `lab` has the gradient checks and measurements. See the repository's `ARCHITECTURE.md` for what is where.
+//! The only dependency that a crate needs: Burn itself is re-exported, and the [`prelude`] has what
+//! most programs use. [`ops`] are the differentiable ops (tensors in, tensors out), [`model`] the
+//! Gaussians, cameras, losses, strategies and optimisers, [`data`] captures and scene files,
+//! [`train`] the training loop and evaluation, and with the feature `lab` `lab` has the gradient
+//! checks and measurements. See the repository's `ARCHITECTURE.md` for what is where.
 //!
 //! ```no_run
 //! use burn_splat::data::scene::ply;

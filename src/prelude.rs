@@ -1,5 +1,5 @@
-//! What most programs use. It has the module `burn` too, which Burn's derives name: with `use burn_splat::prelude::*;`
-//! `#[derive(Module)]` works in a crate that depends on nothing else.
+//! What most programs use. It has the module `burn` too, which Burn's derives name: with `use
+//! burn_splat::prelude::*;` `#[derive(Module)]` works in a crate that depends on nothing else.
 
 pub use burn;
 pub use burn::module::{Module, Param};

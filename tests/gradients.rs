@@ -1,9 +1,9 @@
 //! Every gradient agrees with PyTorch, on every device and in every precision.
 //!
-//! The fixtures in `tests/fixtures` are scenes with the pictures and gradients of a brute-force float64 renderer
-//! (`generate.py`). Gates, on the relative L2 error of every parameter group and picture: 1e-9 in double
-//! precision, 1e-5 in single precision, 1e-3 for the scenes marked hard. The negative controls switch on known
-//! bugs and demand that the same gates notice.
+//! The fixtures in `tests/fixtures` are scenes with the pictures and gradients of a brute-force
+//! float64 renderer (`generate.py`). Gates, on the relative L2 error of every parameter group and
+//! picture: 1e-9 in double precision, 1e-5 in single precision, 1e-3 for the scenes marked hard.
+//! The negative controls switch on known bugs and demand that the same gates notice.
 
 #[cfg(feature = "wgpu")]
 mod adapter;

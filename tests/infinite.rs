@@ -1,5 +1,6 @@
-//! Infinity is a value: opacity logits of plus and minus infinity are opacities of 1 and 0, a log-scale of minus infinity
-//! is a flat Gaussian. They render as their limits, and training leaves them and everything beside them in order.
+//! Infinity is a value: opacity logits of plus and minus infinity are opacities of 1 and 0, a
+//! log-scale of minus infinity is a flat Gaussian. They render as their limits, and training leaves
+//! them and everything beside them in order.
 #![cfg(feature = "cpu")]
 
 #[cfg(feature = "wgpu")]

@@ -1,8 +1,8 @@
-//! Which branches of the readers have been taken, where they were compiled with LLVM's counters (`fuzz/instrument.sh`); in a
-//! build without them there are none, and everything here is empty.
+//! Which branches of the readers have been taken, where they were compiled with LLVM's counters
+//! (`fuzz/instrument.sh`); in a build without them there are none, and everything here is empty.
 //!
-//! The compiler puts an 8-bit counter on every edge of the control flow and calls the two functions below at the start of
-//! the program, with all counters and with an address and a flag for each.
+//! The compiler puts an 8-bit counter on every edge of the control flow and calls the two functions
+//! below at the start of the program, with all counters and with an address and a flag for each.
 
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU8, Ordering};

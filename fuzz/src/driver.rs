@@ -158,7 +158,8 @@ impl Campaign {
         }
     }
 
-    /// Runs an input; says whether it did something new. What is let through is handed on now and then, or always.
+    /// Runs an input; says whether it did something new. What is let through is handed on now and
+    /// then, or always.
     ///
     /// # Errors
     /// When it fails.
@@ -256,7 +257,8 @@ fn hash_of(value: &impl Hash) -> u64 {
     hasher.finish()
 }
 
-/// Keeps the present input in a file, which is there after an abort, and ends the process when it takes too long.
+/// Keeps the present input in a file, which is there after an abort, and ends the process when it
+/// takes too long.
 struct Watch {
     path: PathBuf,
     file: Option<std::fs::File>,
@@ -299,7 +301,8 @@ impl Watch {
     }
 }
 
-/// Looks at a campaign until it is gone. Time is counted by the looks: none are taken while the process is stopped.
+/// Looks at a campaign until it is gone. Time is counted by the looks: none are taken while the
+/// process is stopped.
 fn watch(present: &Weak<AtomicU64>, path: &std::path::Path) {
     const PAUSE: Duration = Duration::from_millis(500);
     let (mut seen, mut time) = (0, Duration::ZERO);

@@ -1,4 +1,5 @@
-//! `splat-fuzz PARSER... --seconds N`: fuzzes readers for some time each; `--replay` runs single inputs.
+//! `splat-fuzz PARSER... --seconds N`: fuzzes readers for some time each; `--replay` runs single
+//! inputs.
 
 use std::path::PathBuf;
 use std::process::ExitCode;

@@ -160,7 +160,8 @@ fn overwrite(bytes: &mut [u8], rng: &mut Pcg64Mcg, new: impl Fn(&mut Pcg64Mcg) -
     bytes[at..at + count].copy_from_slice(&new[..count]);
 }
 
-/// Changes a text by lines and by words; `words` are those of its format. Lines end as they did, or not.
+/// Changes a text by lines and by words; `words` are those of its format. Lines end as they did, or
+/// not.
 pub fn text(text: &mut Vec<u8>, words: &[&str], rng: &mut Pcg64Mcg) {
     let mut lines: Vec<Vec<u8>> = text
         .split(|byte| *byte == b'\n')

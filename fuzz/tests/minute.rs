@@ -1,4 +1,5 @@
-//! Some seconds of fuzzing of every reader, always the same inputs. `fuzz/run.sh` goes on from there.
+//! Some seconds of fuzzing of every reader, always the same inputs. `fuzz/run.sh` goes on from
+//! there.
 
 use splat_fuzz::{Campaign, TARGETS};
 

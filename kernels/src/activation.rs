@@ -1,13 +1,15 @@
-//! The activations of scales and opacities, element by element, and their gradients (3DGS section 5.1).
+//! The activations of scales and opacities, element by element, and their gradients (3DGS section
+//! 5.1).
 //!
 //! ```text
 //! exp(x)                           gradient g exp(x)
 //! sigmoid(x) = 1 / (1 + exp(-x))   gradient g e / (1 + e)²,  e = exp(-|x|)
 //! ```
-//! The gradient of the logistic function is made of its argument: of its value, `y (1 - y)` is zero once y rounds to 1.
+//! The gradient of the logistic function is made of its argument: of its value, `y (1 - y)` is zero
+//! once y rounds to 1.
 //!
-//! Floor per element: 4 bytes read, 4 written, about 18 operations. Gradients: 8 bytes read, 4 written, and one
-//! operation, or about 20.
+//! Floor per element: 4 bytes read, 4 written, about 18 operations. Gradients: 8 bytes read, 4
+//! written, and one operation, or about 20.
 
 use cubecl::prelude::*;
 use splat_core::Activation;
@@ -77,8 +79,8 @@ fn activate_each_vjp(
     }
 }
 
-/// Gradient of the argument `x` of [`activate`], given its value `y` and the gradient of that, in whose memory it is
-/// written if nothing else holds it.
+/// Gradient of the argument `x` of [`activate`], given its value `y` and the gradient of that, in
+/// whose memory it is written if nothing else holds it.
 pub fn activate_vjp(
     client: &Client,
     [x, y]: [&Buffer; 2],

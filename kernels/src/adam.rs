@@ -3,10 +3,11 @@
 //! ```text
 //! m = beta_1 m + (1 - beta_1) g,   v = beta_2 v + (1 - beta_2) g²,   p = p - rate m / (√v + epsilon)
 //! ```
-//! A gradient whose square is not finite counts as zero. Parameter and moments are written where they are read, if
-//! nothing else holds their memory.
+//! A gradient whose square is not finite counts as zero. Parameter and moments are written where
+//! they are read, if nothing else holds their memory.
 //!
-//! Floor per value: 16 bytes read, 12 written, about 12 operations: bound by memory. Of a row that takes no step, 4 read.
+//! Floor per value: 16 bytes read, 12 written, about 12 operations: bound by memory. Of a row that
+//! takes no step, 4 read.
 
 use cubecl::prelude::*;
 use splat_core::{AdamRows, AdamStep};
@@ -76,8 +77,9 @@ fn is_seen(grad: f32) -> bool {
     magnitude > 0u32 && magnitude <= 0x7f80_0000u32
 }
 
-/// Each workgroup has `rows` whole rows, at most as many as it has units. `copied`: which of the results lie elsewhere
-/// than what they are made of, so that what stays as it was must be written too.
+/// Each workgroup has `rows` whole rows, at most as many as it has units. `copied`: which of the
+/// results lie elsewhere than what they are made of, so that what stays as it was must be written
+/// too.
 #[cube(launch)]
 fn adam_seen_rows(
     param: &[f32],

@@ -3,7 +3,8 @@
 //! ```text
 //! out(i) = Σ_k window_k in(i + k - (len - 1)/2)      along x, then along y
 //! ```
-//! The window is symmetric, so the operator is its own adjoint: the gradient is blurred by the same function.
+//! The window is symmetric, so the operator is its own adjoint: the gradient is blurred by the same
+//! function.
 //!
 //! Floor per value: 8 bytes read and 8 written in two passes, 2 operations per pass and tap.
 

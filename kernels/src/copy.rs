@@ -1,6 +1,7 @@
 //! A copy, to measure what the device's memory gives.
 //!
-//! Floor per value: 4 bytes read, 4 written, no operation: whatever this reaches, a stage bound by memory can reach.
+//! Floor per value: 4 bytes read, 4 written, no operation: whatever this reaches, a stage bound by
+//! memory can reach.
 
 use std::time::Instant;
 
@@ -17,8 +18,9 @@ fn copy_values(from: &[f32], to: &mut [f32], len: u32) {
     }
 }
 
-/// Bytes read and written per second by a kernel that copies `len` floats, one to a unit: the best of some runs, each
-/// long enough that waiting for its end hardly counts. Take more than the device's caches hold.
+/// Bytes read and written per second by a kernel that copies `len` floats, one to a unit: the best
+/// of some runs, each long enough that waiting for its end hardly counts. Take more than the
+/// device's caches hold.
 ///
 /// # Errors
 /// The device's error, in words; or that there is nothing to copy.

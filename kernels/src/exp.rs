@@ -1,10 +1,12 @@
-//! Exponentials, of our own: device libraries differ from each other by several units in the last place.
+//! Exponentials, of our own: device libraries differ from each other by several units in the last
+//! place.
 //!
-//! `2^-t = 2^n 2^-g` with `|g| <= 1/2`, g exact, and a polynomial of degree 5 for `2^-g`; `e^x` alike, of any x. Both with
-//! the same coefficients in the same order as on the native path of `splat-ops`. Every product and sum is a spelled-out
-//! fused multiply-add on both: where the device fuses, both give the same bits; where it does not, they differ in the
-//! last place. No compiler is left the choice, so that the forward and the backward kernel round alike. Floor: 15
-//! operations, and 22 of any x.
+//! `2^-t = 2^n 2^-g` with `|g| <= 1/2`, g exact, and a polynomial of degree 5 for `2^-g`; `e^x`
+//! alike, of any x. Both with the same coefficients in the same order as on the native path of
+//! `splat-ops`. Every product and sum is a spelled-out fused multiply-add on both: where the device
+//! fuses, both give the same bits; where it does not, they differ in the last place. No compiler is
+//! left the choice, so that the forward and the backward kernel round alike. Floor: 15 operations,
+//! and 22 of any x.
 
 use cubecl::prelude::*;
 use splat_core::exp::{EXP, EXP_LN2_HIGH, EXP_LN2_LOW, EXP2_NEG, ROUND_TO_INTEGER};
@@ -49,7 +51,8 @@ pub(crate) fn exp2_neg(t: f32) -> f32 {
 const LN2_HIGH: i32 = EXP_LN2_HIGH;
 const LN2_LOW: f32 = EXP_LN2_LOW;
 
-/// `exp(x) = 2^n e^r` with `|r| <= ln(2) / 2`, for any x: infinite and zero where that is out of range, NaN for NaN.
+/// `exp(x) = 2^n e^r` with `|r| <= ln(2) / 2`, for any x: infinite and zero where that is out of
+/// range, NaN for NaN.
 #[cube]
 pub(crate) fn exp(x: f32) -> f32 {
     // Beyond these the result is infinite or zero anyway. Written so that NaN passes both.
@@ -57,11 +60,13 @@ pub(crate) fn exp(x: f32) -> f32 {
     let x = select(x > 89.0f32, 89.0f32, x);
     let shifted = fma(x, core::f32::consts::LOG2_E, ROUND);
     let n = i32::reinterpret(shifted) - ROUND_BITS;
-    // The product in integers: of two of floats, with one factor in common, a compiler may make one.
+    // The product in integers: of two of floats, with one factor in common, a compiler may make
+    // one.
     let high = x - (n * LN2_HIGH) as f32 / 512.0f32;
     let r = fma(-(n as f32), LN2_LOW, high);
     let p = polynomial(r, E_5, E_4, E_3, E_2, E_1);
-    // n may be 128, or -150: neither is the exponent of a normal number, but those of its halves are.
+    // n may be 128, or -150: neither is the exponent of a normal number, but those of its halves
+    // are.
     let n = u32::reinterpret(n);
     let half = ((n + 1024u32) >> 1u32) - 512u32;
     p * two_to(half) * two_to(n - half)

@@ -1,11 +1,13 @@
-//! The bytes of device memory that a training step cannot do without: every stage reads each of its inputs and writes
-//! each of its results once, with a perfect cache within a stage and none between stages.
+//! The bytes of device memory that a training step cannot do without: every stage reads each of its
+//! inputs and writes each of its results once, with a perfect cache within a stage and none between
+//! stages.
 //!
-//! Each stage states its own beside its kernels (`floor`); here they are put together for one camera. Counted are the
-//! kernels of this crate alone, not the tensor ops between them. Two estimates are in it: the lists of all tiles count
-//! to their ends, also where all pixels stop earlier; and what is said per Gaussian counts all of them, also those out
-//! of view, but for the colours, which leave those out. Neither is a bound that a kernel could not go below by knowing more
-//! than its input.
+//! Each stage states its own beside its kernels (`floor`); here they are put together for one
+//! camera. Counted are the kernels of this crate alone, not the tensor ops between them. Two
+//! estimates are in it: the lists of all tiles count to their ends, also where all pixels stop
+//! earlier; and what is said per Gaussian counts all of them, also those out of view, but for the
+//! colours, which leave those out. Neither is a bound that a kernel could not go below by knowing
+//! more than its input.
 
 use crate::{
     activation, adam, intersect, photometric, project, rasterize, screen_statistics, sh_colors,

@@ -1,17 +1,19 @@
 //! Which splats touch which tiles, front to back (3DGS section 6).
 //!
-//! Visible splats are packed together in the order of their index and sorted by depth (equal depths by index); each
-//! emits the tiles it touches in that order; a stable sort by tile then leaves the list of every tile in depth order. An
-//! *intersection* is one (splat, tile) pair, its *slot* its place in the order of emission: the slots of one splat are
-//! consecutive, so that gradients that were written to slots can be summed splat by splat, in order.
+//! Visible splats are packed together in the order of their index and sorted by depth (equal depths
+//! by index); each emits the tiles it touches in that order; a stable sort by tile then leaves the
+//! list of every tile in depth order. An *intersection* is one (splat, tile) pair, its *slot* its
+//! place in the order of emission: the slots of one splat are consecutive, so that gradients that
+//! were written to slots can be summed splat by splat, in order.
 //!
-//! A splat touches a tile iff the ellipse `opacity exp(-sigma) >= alpha_min` meets the rectangle of the tile's pixel
-//! centres: sigma is convex, so unless its centre lies in the rectangle its minimum lies on an edge that faces it. One
-//! unit tries the tiles of one splat; those of a splat over more than 64 tiles are shared out to its workgroup.
+//! A splat touches a tile iff the ellipse `opacity exp(-sigma) >= alpha_min` meets the rectangle of
+//! the tile's pixel centres: sigma is convex, so unless its centre lies in the rectangle its
+//! minimum lies on an edge that faces it. One unit tries the tiles of one splat; those of a splat
+//! over more than 64 tiles are shared out to its workgroup.
 //!
-//! Floor: 28 bytes per splat read and 8 written per visible one; then per visible splat 32 bytes twice (counting and
-//! emitting) and some 40 operations per tile of its bounding box; 12 bytes written per intersection, and read again
-//! after the sort.
+//! Floor: 28 bytes per splat read and 8 written per visible one; then per visible splat 32 bytes
+//! twice (counting and emitting) and some 40 operations per tile of its bounding box; 12 bytes
+//! written per intersection, and read again after the sort.
 
 mod capacity;
 mod footprint;
@@ -95,7 +97,8 @@ pub(crate) struct Grid {
 pub struct TileLists {
     /// Number of intersections.
     pub intersections: usize,
-    /// Splat (camera N + Gaussian) of every intersection, by tile, front to back; there may be room for more.
+    /// Splat (camera N + Gaussian) of every intersection, by tile, front to back; there may be room
+    /// for more.
     pub splats: Buffer,
     /// First intersection and end of every tile [tiles, 2].
     pub ranges: Buffer,
@@ -152,11 +155,12 @@ pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     }
 }
 
-/// Lists the splats of every tile: `packed` [C, N, 9], `opacities` [C, N]. Waits for the device once, to learn the
-/// number of intersections.
+/// Lists the splats of every tile: `packed` [C, N, 9], `opacities` [C, N]. Waits for the device
+/// once, to learn the number of intersections.
 ///
 /// # Errors
-/// More intersections than can be indexed or than a buffer of the device holds, or a failing device.
+/// More intersections than can be indexed or than a buffer of the device holds, or a failing
+/// device.
 pub fn intersect(
     client: &Client,
     packed: &Buffer,
@@ -168,9 +172,10 @@ pub fn intersect(
     Ok(counted.list(client, intersections))
 }
 
-/// Lists the splats of every tile as [`intersect`] does, and hands the lists to `then`, without a pause of the device:
-/// room is made for somewhat more intersections than there were lately, and the number is looked at when all is under way.
-/// Only if there were more is everything done once more.
+/// Lists the splats of every tile as [`intersect`] does, and hands the lists to `then`, without a
+/// pause of the device: room is made for somewhat more intersections than there were lately, and
+/// the number is looked at when all is under way. Only if there were more is everything done once
+/// more.
 pub(crate) fn intersect_ahead<R>(
     client: &Client,
     packed: &Buffer,

@@ -16,10 +16,11 @@ pub const CUBE_UNITS: u32 = 256;
 /// [`CUBE_UNITS`] as an index.
 pub(crate) const CUBE_UNITS_USIZE: usize = CUBE_UNITS as usize;
 
-/// Most storage buffers that a kernel of this crate binds. In WGSL CubeCL binds one more, with lengths and scalars.
+/// Most storage buffers that a kernel of this crate binds. In WGSL CubeCL binds one more, with
+/// lengths and scalars.
 ///
-/// Devices promise no more than 8 (`max_storage_buffers_per_shader_stage`, WebGPU's default); wgpu itself says 16 of
-/// DirectX devices without resource binding tier 3 and 29 of Metal.
+/// Devices promise no more than 8 (`max_storage_buffers_per_shader_stage`, WebGPU's default); wgpu
+/// itself says 16 of DirectX devices without resource binding tier 3 and 29 of Metal.
 pub const MOST_BUFFERS: u32 = 12;
 
 /// How many storage buffers kernels can bind on this device, CubeCL's own left out.
@@ -36,8 +37,8 @@ static POISON: AtomicBool = AtomicBool::new(false);
 /// NaN as a float; as an index, far outside of any buffer.
 const POISONED: u32 = 0x7fc0_0000;
 
-/// For tests, and for the whole process: from now on reserved memory is (or is no longer) full of NaN, so that an
-/// element that a kernel reads but none has written shows in the results.
+/// For tests, and for the whole process: from now on reserved memory is (or is no longer) full of
+/// NaN, so that an element that a kernel reads but none has written shows in the results.
 #[doc(hidden)]
 pub fn poison(on: bool) {
     POISON.store(on, Ordering::Relaxed);
@@ -135,8 +136,8 @@ impl Buffer {
         self.start_reading(client).wait()
     }
 
-    /// Begins to copy the elements to the host. Work that is launched from now on neither delays the copy nor waits for
-    /// it.
+    /// Begins to copy the elements to the host. Work that is launched from now on neither delays
+    /// the copy nor waits for it.
     pub(crate) fn start_reading<'a>(&self, client: &'a Client) -> PendingRead<'a> {
         PendingRead(Box::pin(client.read_async(vec![self.handle.clone()])))
     }
@@ -146,8 +147,9 @@ impl Buffer {
         !self.handle.can_mut()
     }
 
-    /// For a kernel that reads this buffer as its buffer number `position` and writes a result of the same length: where
-    /// that comes, the same memory if nothing else holds it, and the arguments for both.
+    /// For a kernel that reads this buffer as its buffer number `position` and writes a result of
+    /// the same length: where that comes, the same memory if nothing else holds it, and the
+    /// arguments for both.
     pub(crate) fn overwritten(self, client: &Client, position: usize) -> (Self, [BufferArg; 2]) {
         if !self.is_held() {
             let arguments = [self.arg(), BufferArg::alias(position, self.len.max(1))];
@@ -160,13 +162,14 @@ impl Buffer {
 
     /// The buffer as a kernel argument.
     pub(crate) fn arg(&self) -> BufferArg {
-        // SAFETY: both constructors make sure that the handle holds `len` elements of four bytes, and every kernel of
-        // this crate views buffers as `f32` or `u32`.
+        // SAFETY: both constructors make sure that the handle holds `len` elements of four bytes,
+        // and every kernel of this crate views buffers as `f32` or `u32`.
         unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len.max(1)) }
     }
 }
 
-/// A device buffer of `len` floats of half precision, contiguous. Kernels read it where the device can.
+/// A device buffer of `len` floats of half precision, contiguous. Kernels read it where the device
+/// can.
 #[derive(Clone, Debug)]
 pub struct HalfBuffer {
     handle: Handle,
@@ -227,8 +230,8 @@ impl PendingRead<'_> {
     }
 }
 
-/// `cubes` workgroups, folded into two dimensions when there are more than one dimension can hold. Kernels see one
-/// linear `CUBE_POS`, which may run past `cubes`: they check it.
+/// `cubes` workgroups, folded into two dimensions when there are more than one dimension can hold.
+/// Kernels see one linear `CUBE_POS`, which may run past `cubes`: they check it.
 ///
 /// Every launch asks here once for its workgroups, so this is where launches are counted.
 pub(crate) fn cube_count(cubes: usize) -> CubeCount {

@@ -1,18 +1,21 @@
 //! CubeCL kernels for Gaussian splatting, and nothing else: no tensor library.
 //!
-//! One file per stage, the forward pass beside its vector-Jacobian product, in the order of the data's way:
-//! [`activation`], [`project`] and [`sh_colors`] (of spherical harmonics, [`sh`]) turn Gaussians into screen splats and
-//! their colours; [`intersect`] lists which tiles every splat touches, with [`scan`] and [`sort`]; [`rasterize`] blends
-//! each tile front to back; [`photometric`] compares the image with a photo. [`adam`] and [`screen_statistics`] are what
-//! else a training step does to every parameter and Gaussian. [`ssim`] is similarity pixel by pixel, [`blur`] a window by
-//! itself, [`exp`] our own exponential. [`work`] counts what was launched, [`floor`] says what it cannot do without, and
-//! [`copy`] how fast the device's memory is.
+//! One file per stage, the forward pass beside its vector-Jacobian product, in the order of the
+//! data's way: [`activation`], [`project`] and [`sh_colors`] (of spherical harmonics, [`sh`]) turn
+//! Gaussians into screen splats and their colours; [`intersect`] lists which tiles every splat
+//! touches, with [`scan`] and [`sort`]; [`rasterize`] blends each tile front to back;
+//! [`photometric`] compares the image with a photo. [`adam`] and [`screen_statistics`] are what
+//! else a training step does to every parameter and Gaussian. [`ssim`] is similarity pixel by
+//! pixel, [`blur`] a window by itself, [`exp`] our own exponential. [`work`] counts what was
+//! launched, [`floor`] says what it cannot do without, and [`copy`] how fast the device's memory
+//! is.
 //!
-//! Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous, row-major) and launch kernels without
-//! waiting, except where they say so. The same input gives the same bits on one device, unless a caller asks the
-//! rasteriser for sums without order ([`rasterize::Sums`]).
+//! Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous, row-major) and
+//! launch kernels without waiting, except where they say so. The same input gives the same bits on
+//! one device, unless a caller asks the rasteriser for sums without order ([`rasterize::Sums`]).
 
-// `if comptime!(...)` decides while a kernel is built; joined to a condition on the device it would decide there.
+// `if comptime!(...)` decides while a kernel is built; joined to a condition on the device it would
+// decide there.
 #![allow(clippy::collapsible_if)]
 
 pub mod activation;

@@ -1,15 +1,16 @@
-//! Mean absolute difference and mean structural similarity of a rendered image and a photo, in one launch and one that
-//! adds its sums; the gradient in one more. S and its derivatives are those of [`crate::ssim`].
+//! Mean absolute difference and mean structural similarity of a rendered image and a photo, in one
+//! launch and one that adds its sums; the gradient in one more. S and its derivatives are those of
+//! [`crate::ssim`].
 //!
-//! A workgroup has a tile of one channel. It windows the rows into shared memory, a unit making eight neighbouring values
-//! of each moment, and then the columns from there. What the gradient needs is kept, of each value three: weight times
-//! dS/dmx, dS/dq and dS/dp, channel by channel. The weight is one over the number of values that count, and zero for a
-//! value that does not.
+//! A workgroup has a tile of one channel. It windows the rows into shared memory, a unit making
+//! eight neighbouring values of each moment, and then the columns from there. What the gradient
+//! needs is kept, of each value three: weight times dS/dmx, dS/dq and dS/dp, channel by channel.
+//! The weight is one over the number of values that count, and zero for a value that does not.
 //!
-//! Floor per pixel and channel. Forward: 4 bytes read and 1 of an 8-bit photo, or 4 of another; 12 written to be kept;
-//! 2 x 4 x 11 fused multiply-adds with the window of 11. Gradient: 12 read, and both images again, 4 written; 2 x 3 x 11
-//! fused multiply-adds. Values under the window but outside of the tile are read by its neighbours too, rows of them
-//! windowed twice: 26 rows for 16.
+//! Floor per pixel and channel. Forward: 4 bytes read and 1 of an 8-bit photo, or 4 of another; 12
+//! written to be kept; 2 x 4 x 11 fused multiply-adds with the window of 11. Gradient: 12 read, and
+//! both images again, 4 written; 2 x 3 x 11 fused multiply-adds. Values under the window but
+//! outside of the tile are read by its neighbours too, rows of them windowed twice: 26 rows for 16.
 
 mod backward;
 mod forward;
@@ -110,8 +111,8 @@ impl PhotometricShape {
         self.images * self.channels * columns * rows
     }
 
-    /// How far from the image's edges a pixel counts for the mean similarity: that of a window that reaches over them
-    /// does not, unless all do.
+    /// How far from the image's edges a pixel counts for the mean similarity: that of a window that
+    /// reaches over them does not, unless all do.
     fn margin(&self) -> usize {
         let taps = self.window.len();
         if self.height < taps || self.width < taps {
@@ -216,8 +217,8 @@ fn measure(
     (means, fields)
 }
 
-/// Gradient of what was rendered, [B, H, W, E], given what [`photometric_tracked`] kept and the gradient `[2]` of its
-/// means.
+/// Gradient of what was rendered, [B, H, W, E], given what [`photometric_tracked`] kept and the
+/// gradient `[2]` of its means.
 pub fn photometric_vjp(
     client: &Client,
     images: Images,

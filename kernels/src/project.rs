@@ -1,6 +1,8 @@
-//! Projection of 3D Gaussians to screen splats, and its vector-Jacobian product (3DGS section 4; gsplat appendix).
+//! Projection of 3D Gaussians to screen splats, and its vector-Jacobian product (3DGS section 4;
+//! gsplat appendix).
 //!
-//! Per camera and Gaussian, with W, t the view matrix, R the rotation of the normalised quaternion, s the scale:
+//! Per camera and Gaussian, with W, t the view matrix, R the rotation of the normalised quaternion,
+//! s the scale:
 //! ```text
 //! p = W mean + t = (x, y, z)                      mean2d = (fx x/z + cx, fy y/z + cy)
 //! u = clamp(x/z), v = clamp(y/z)                  J = [fx/z, 0, -fx u/z; 0, fy/z, -fy v/z]
@@ -8,14 +10,15 @@
 //! a = |V1|² + e, b = V1·V2                        det = |m|² + e(|V1|² + |V2|²) + e²
 //! w11 = 1/√a, w22 = √(a/det), w21 = -(b/a) w22    compensation = |m| / √det
 //! ```
-//! The determinant is a sum of terms that are never negative (Cauchy-Binet), so needles keep their precision. V and e
-//! are taken in units of the splat's own size (k pixels), so that nothing over- or underflows, be the splat a millionth
-//! of a pixel or a million pictures wide.
-//! Floor per Gaussian and camera: 40 bytes read, 36 written, about 150 operations; gradients: 76 bytes read, 40 written,
-//! and once more 76 read for those of cameras.
+//! The determinant is a sum of terms that are never negative (Cauchy-Binet), so needles keep their
+//! precision. V and e are taken in units of the splat's own size (k pixels), so that nothing over-
+//! or underflows, be the splat a millionth of a pixel or a million pictures wide. Floor per
+//! Gaussian and camera: 40 bytes read, 36 written, about 150 operations; gradients: 76 bytes read,
+//! 40 written, and once more 76 read for those of cameras.
 //!
-//! One unit projects one Gaussian to one camera (`splat.rs`, by way of `camera.rs`; their gradients `vjp.rs`). Gradients of Gaussians are summed over cameras inside one unit;
-//! gradients of cameras by blocks of Gaussians and then over the blocks, always in the same order: no atomics.
+//! One unit projects one Gaussian to one camera (`splat.rs`, by way of `camera.rs`; their gradients
+//! `vjp.rs`). Gradients of Gaussians are summed over cameras inside one unit; gradients of cameras
+//! by blocks of Gaussians and then over the blocks, always in the same order: no atomics.
 
 mod backward;
 mod camera;
@@ -31,8 +34,8 @@ use self::splat::{Gaussian, project_splat};
 use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 
-/// Image size and [`ProjectSettings`] on the device; `blur` = √e; `reach` = √(2 ln(1/alpha_min)), standard deviations to
-/// the edge of a splat.
+/// Image size and [`ProjectSettings`] on the device; `blur` = √e; `reach` = √(2 ln(1/alpha_min)),
+/// standard deviations to the edge of a splat.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 struct Uniforms {

@@ -1,4 +1,5 @@
-//! Blending of the tiles, front to back, and its vector-Jacobian product (3DGS section 6 and appendix C).
+//! Blending of the tiles, front to back, and its vector-Jacobian product (3DGS section 6 and
+//! appendix C).
 //!
 //! Per pixel, over the splats i of its tile in depth order, d = pixel centre - mean:
 //! ```text
@@ -6,16 +7,17 @@
 //! skip if raw < alpha_min;  alpha = min(alpha_max, raw);  stop before T (1 - alpha) < transmittance_min
 //! image += T alpha colour;  T *= 1 - alpha;     at the end  image += T background;  A = 1 - T
 //! ```
-//! Backward goes back to front and recovers T by division. With g the pixel's gradient (g_A for A) and
-//! `behind = T_end (background · g - g_A) + Σ of T alpha (colour · g) over the splats behind`:
+//! Backward goes back to front and recovers T by division. With g the pixel's gradient (g_A for A)
+//! and `behind = T_end (background · g - g_A) + Σ of T alpha (colour · g) over the splats behind`:
 //! ```text
 //! dL/dcolour = T alpha g,   dL/dalpha = T (colour · g) - behind / (1 - alpha)     (0 at the cap)
 //! ```
-//! Gradients of one intersection are summed over the tile's pixels in fixed order. By default each writes to
-//! its own slot, and then the slots of every splat are summed in order: the same bits every time. [`Sums`] has the other
-//! way, without slots.
+//! Gradients of one intersection are summed over the tile's pixels in fixed order. By default each
+//! writes to its own slot, and then the slots of every splat are summed in order: the same bits
+//! every time. [`Sums`] has the other way, without slots.
 //!
-//! Any number of channels: those beyond what one launch can do (at most [`MAX_CHANNELS`]) go in further ones.
+//! Any number of channels: those beyond what one launch can do (at most [`MAX_CHANNELS`]) go in
+//! further ones.
 
 mod background;
 mod backward;
@@ -44,8 +46,8 @@ use crate::math::is_finite;
 /// Most channels of one launch; fewer where a unit has many pixels.
 pub const MAX_CHANNELS: usize = 32;
 
-/// Gradients of one intersection that a 32-bit index reaches however many intersections there are; more of them only
-/// of fewer.
+/// Gradients of one intersection that a 32-bit index reaches however many intersections there are;
+/// more of them only of fewer.
 pub const MAX_SLOT_VALUES: usize = SHAPE_GRADIENTS + MAX_CHANNELS / 2;
 
 /// Thresholds of the blending, and how its gradients are summed.
@@ -80,11 +82,13 @@ pub struct RasterizeState {
     pub lists: TileLists,
     /// Transmittance that is left of every pixel [C, H, W].
     pub transmittance: Buffer,
-    /// How many splats of its tile's list every pixel has walked, the last one that contributed included [C, H, W].
+    /// How many splats of its tile's list every pixel has walked, the last one that contributed
+    /// included [C, H, W].
     pub walked: Buffer,
 }
 
-/// Splats, and what colours them: `packed` [C, N, 9], `colors` [C, N, D], `opacities` [C, N], `background` [C, D].
+/// Splats, and what colours them: `packed` [C, N, 9], `colors` [C, N, D], `opacities` [C, N],
+/// `background` [C, D].
 #[derive(Clone, Debug)]
 pub struct RasterizeInputs {
     /// Packed splats of [`crate::project`].
@@ -99,7 +103,8 @@ pub struct RasterizeInputs {
     pub channels: usize,
 }
 
-/// The opacity of every splat, zero where a colour is not finite: it is then in no list, and nothing reads it.
+/// The opacity of every splat, zero where a colour is not finite: it is then in no list, and
+/// nothing reads it.
 #[cube(launch)]
 fn hide_broken_colors(
     colors: &[f32],
@@ -137,9 +142,9 @@ fn without_broken_colors(client: &Client, inputs: &RasterizeInputs, frames: &Fra
     out
 }
 
-/// Renders all cameras: the image with alpha as its last channel [C, H, W, D + 1], and what the backward pass needs.
-/// Waits once until the
-/// number of intersections is known, while the device goes on.
+/// Renders all cameras: the image with alpha as its last channel [C, H, W, D + 1], and what the
+/// backward pass needs. Waits once until the number of intersections is known, while the device
+/// goes on.
 ///
 /// # Errors
 /// Those of [`crate::intersect::intersect`].
@@ -166,8 +171,8 @@ pub fn rasterize(
     Ok((output, state))
 }
 
-/// Renders with lists that are there already: the image, and of every pixel the transmittance that is left and how many
-/// splats it has walked. `counting`: see [`rasterize_forward`].
+/// Renders with lists that are there already: the image, and of every pixel the transmittance that
+/// is left and how many splats it has walked. `counting`: see [`rasterize_forward`].
 fn blend(
     client: &Client,
     inputs: &RasterizeInputs,
@@ -208,10 +213,12 @@ fn blend(
     [output, transmittance, walked]
 }
 
-/// Floors of forward and gradient for one camera, with lists that are there; the gradient summed in order.
+/// Floors of forward and gradient for one camera, with lists that are there; the gradient summed in
+/// order.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let (i, pixels, color) = (sizes.intersections, sizes.pixels(), 4 * sizes.channels);
-    // In the gradient: its sums per intersection, written and read again, and what becomes of them per Gaussian.
+    // In the gradient: its sums per intersection, written and read again, and what becomes of them
+    // per Gaussian.
     let sums = (24 + color) * i;
     let packed_and_opacity = 4 * (PROJECTED_WIDTH as u64 + 1);
     [

@@ -1,4 +1,5 @@
-//! Sums over many units in a fixed order: by halves within a workgroup, then workgroup after workgroup.
+//! Sums over many units in a fixed order: by halves within a workgroup, then workgroup after
+//! workgroup.
 //!
 //! Floor per value: 4 bytes read and an addition.
 
@@ -6,8 +7,8 @@ use cubecl::prelude::*;
 
 use crate::launch::{Buffer, per_element};
 
-/// The sum of `value` over the `units` of the workgroup, a power of two; all of them must come here. `shared` has room
-/// for one float of each.
+/// The sum of `value` over the `units` of the workgroup, a power of two; all of them must come
+/// here. `shared` has room for one float of each.
 #[cube]
 pub(crate) fn sum_units(shared: &mut Shared<[f32]>, value: f32, #[comptime] units: usize) -> f32 {
     let unit = UNIT_POS as usize;

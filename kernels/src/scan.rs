@@ -1,7 +1,8 @@
 //! Prefix sums of `u32`, any length, modulo 2^32.
 //!
-//! Three steps: every workgroup sums its block; the block sums are scanned in the same way (one level less); every
-//! workgroup scans its block again on top of its block's start. Sums of integers, so the same bits in any order.
+//! Three steps: every workgroup sums its block; the block sums are scanned in the same way (one
+//! level less); every workgroup scans its block again on top of its block's start. Sums of
+//! integers, so the same bits in any order.
 //!
 //! Floor per element: 8 bytes read (it is read twice), 4 written, 3 additions.
 
@@ -14,8 +15,8 @@ const ITEMS: usize = 8;
 /// Elements of one workgroup.
 pub(crate) const BLOCK: usize = CUBE_UNITS_USIZE * ITEMS;
 
-/// Exclusive prefix sum over the `units` of a workgroup, and the total. Every unit must call it; `shared` holds one
-/// value per unit.
+/// Exclusive prefix sum over the `units` of a workgroup, and the total. Every unit must call it;
+/// `shared` holds one value per unit.
 #[cube]
 pub(crate) fn cube_exclusive_sum(
     value: u32,
@@ -58,7 +59,8 @@ fn block_sums(input: &[u32], sums: &mut [u32], len: u32, blocks: u32) {
     }
 }
 
-/// Scans each block of `input`, starting from `starts[block]` (from 0 where there is one block only).
+/// Scans each block of `input`, starting from `starts[block]` (from 0 where there is one block
+/// only).
 #[cube(launch)]
 fn scan_blocks(
     input: &[u32],
@@ -168,9 +170,10 @@ impl PendingTotal<'_> {
     }
 }
 
-/// The exclusive sum, and the total of all elements without overflow: the blocks' sums are read back and added in
-/// 64 bits (2,048 elements share one sum, so elements up to 2^21 are safe). Does not wait for the device: what is
-/// launched before [`PendingTotal::wait`] runs while the total is on its way.
+/// The exclusive sum, and the total of all elements without overflow: the blocks' sums are read
+/// back and added in 64 bits (2,048 elements share one sum, so elements up to 2^21 are safe). Does
+/// not wait for the device: what is launched before [`PendingTotal::wait`] runs while the total is
+/// on its way.
 pub fn exclusive_sum_with_total<'a>(
     client: &'a Client,
     input: &Buffer,

@@ -1,8 +1,8 @@
-//! Sums that density control keeps of every Gaussian (3DGS section 5.2): lengths of the gradients of its screen mean,
-//! and views that saw it.
+//! Sums that density control keeps of every Gaussian (3DGS section 5.2): lengths of the gradients
+//! of its screen mean, and views that saw it.
 //!
-//! A gradient whose length is not finite counts as zero, so that it does not hide the other views. One unit adds all
-//! cameras of one Gaussian, in order.
+//! A gradient whose length is not finite counts as zero, so that it does not hide the other views.
+//! One unit adds all cameras of one Gaussian, in order.
 //!
 //! Gradients and extents are read out of the rows of packed splats, where they lie.
 //!
@@ -56,8 +56,9 @@ fn add_screen_statistics(
     }
 }
 
-/// Gradients of packed splats and these themselves, both `[C, N, 9]`, and sums of lengths and of views, both `[N]`, to
-/// these sums with the lengths of `half * gradient` and the views added: in their own memory, where nothing else holds it.
+/// Gradients of packed splats and these themselves, both `[C, N, 9]`, and sums of lengths and of
+/// views, both `[N]`, to these sums with the lengths of `half * gradient` and the views added: in
+/// their own memory, where nothing else holds it.
 pub fn screen_statistics(
     client: &Client,
     [gradient, packed]: [&Buffer; 2],

@@ -1,13 +1,15 @@
-//! Spherical harmonics of a direction: colour per view, and the vector-Jacobian product (basis and constants of 3DGS).
+//! Spherical harmonics of a direction: colour per view, and the vector-Jacobian product (basis and
+//! constants of 3DGS).
 //!
 //! ```text
 //! colour = Σ_k Y_k(d / |d|) coefficient_k
 //! ```
-//! Real basis in homogeneous form, `(degree + 1)²` functions; the zero direction stays zero and takes no gradient.
-//! The gradient of the coefficients is summed over cameras inside one unit.
+//! Real basis in homogeneous form, `(degree + 1)²` functions; the zero direction stays zero and
+//! takes no gradient. The gradient of the coefficients is summed over cameras inside one unit.
 //!
-//! Floor per Gaussian and camera, with K = `(degree + 1)²`: 12 bytes of direction and 12 K of coefficients read, 12
-//! written, about 9 K operations. Gradients: 24 bytes and 12 K read, 12 and 12 K written, about 18 K operations.
+//! Floor per Gaussian and camera, with K = `(degree + 1)²`: 12 bytes of direction and 12 K of
+//! coefficients read, 12 written, about 9 K operations. Gradients: 24 bytes and 12 K read, 12 and
+//! 12 K written, about 18 K operations.
 
 use cubecl::prelude::*;
 use splat_core::{SH_C0, SH_C1, SH_C2, SH_C3, SH_DEGREE_MAX, sh_coefficient_count};
@@ -103,7 +105,8 @@ fn basis_vjp(d: Vec3, g: &Array<f32>, #[comptime] degree: usize) -> Vec3 {
     Vec3::new(gx, gy, gz)
 }
 
-/// The gradient of d, given those `g` of the functions of v = d/|d|: (h - v (v · h)) / |d|, h as in [`basis_vjp`].
+/// The gradient of d, given those `g` of the functions of v = d/|d|: (h - v (v · h)) / |d|, h as in
+/// [`basis_vjp`].
 #[cube]
 pub(crate) fn direction_vjp(
     v: Vec3,
@@ -115,8 +118,8 @@ pub(crate) fn direction_vjp(
     h.sub(v.scale(v.dot(h))).scale(inverse)
 }
 
-/// `g · coefficient`. A channel without gradient (black, and clamped there) does not look at its coefficient, which may
-/// be infinite.
+/// `g · coefficient`. A channel without gradient (black, and clamped there) does not look at its
+/// coefficient, which may be infinite.
 #[cube]
 pub(crate) fn guarded_dot(g: Vec3, coefficient: Vec3) -> f32 {
     select(g.x == 0.0f32, 0.0f32, g.x * coefficient.x)
@@ -124,7 +127,8 @@ pub(crate) fn guarded_dot(g: Vec3, coefficient: Vec3) -> f32 {
         + select(g.z == 0.0f32, 0.0f32, g.z * coefficient.z)
 }
 
-/// 1 / |d|, and 0 for the zero direction. By way of d / max|dᵢ|, so that the squares neither overflow nor underflow.
+/// 1 / |d|, and 0 for the zero direction. By way of d / max|dᵢ|, so that the squares neither
+/// overflow nor underflow.
 #[cube]
 pub(crate) fn inverse_length(d: Vec3) -> f32 {
     let largest = d.max_abs();
@@ -166,8 +170,9 @@ fn sh_forward(
     }
 }
 
-/// Colours [C, N, 3] for coefficients [N, `stored`, 3] and directions [C, N, 3] of any length. Coefficients beyond
-/// `(degree + 1)²` are not read; `degree` is cut to [`SH_DEGREE_MAX`] and to what is stored.
+/// Colours [C, N, 3] for coefficients [N, `stored`, 3] and directions [C, N, 3] of any length.
+/// Coefficients beyond `(degree + 1)²` are not read; `degree` is cut to [`SH_DEGREE_MAX`] and to
+/// what is stored.
 pub fn evaluate(
     client: &Client,
     coefficients: &Buffer,
@@ -271,7 +276,8 @@ fn sh_backward_dirs(
         let inverse = inverse_length(d);
         let v = d.scale(inverse);
         let first = index % gaussians * stored as usize * 3;
-        // A splat that is not seen is not evaluated: were it NaN, zero times it would be too, and reach the camera.
+        // A splat that is not seen is not evaluated: were it NaN, zero times it would be too, and
+        // reach the camera.
         if g.max_abs() != 0.0f32 {
             let mut weights = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
             #[unroll]
@@ -285,8 +291,8 @@ fn sh_backward_dirs(
     }
 }
 
-/// Gradients of the coefficients [N, `stored`, 3] and directions [C, N, 3] for that of the colours [C, N, 3]; only
-/// those that `needs_grad` names.
+/// Gradients of the coefficients [N, `stored`, 3] and directions [C, N, 3] for that of the colours
+/// [C, N, 3]; only those that `needs_grad` names.
 pub fn evaluate_backward(
     client: &Client,
     coefficients: &Buffer,

@@ -1,18 +1,22 @@
-//! Colours of Gaussians in the directions of the cameras, and the vector-Jacobian product (3DGS section 4).
+//! Colours of Gaussians in the directions of the cameras, and the vector-Jacobian product (3DGS
+//! section 4).
 //!
 //! ```text
 //! colour = max(Σ_k Y_k(d / |d|) coefficient_k + 1/2, 0),   d = mean - centre
 //! ```
-//! A channel below zero takes no gradient, one that is exactly zero does. Directions are made where they are used.
-//! Gradients of Gaussians are summed over cameras inside one unit; those of the centres by blocks of Gaussians and then
-//! over the blocks, in order: no atomics.
+//! A channel below zero takes no gradient, one that is exactly zero does. Directions are made where
+//! they are used. Gradients of Gaussians are summed over cameras inside one unit; those of the
+//! centres by blocks of Gaussians and then over the blocks, in order: no atomics.
 //!
-//! Gaussians that a camera culled are not evaluated, if the packed splats are given: they are black and pass nothing on.
+//! Gaussians that a camera culled are not evaluated, if the packed splats are given: they are black
+//! and pass nothing on.
 //!
-//! Floor, with K = `(degree + 1)²`: 12 bytes of mean and 12 K of coefficients read per Gaussian that a camera sees; for
-//! every camera 4 read and 12 written of each Gaussian, and about 9 K + 25 operations of each that it sees. Gradients:
-//! 12 + 12 K read of each that is seen, and for every camera 12 and of each that it sees 4; 12 + 12 K written; for every
-//! camera about 24 K + 40 operations of each that it sees. Gradients of centres, if wanted, read and compute that once more.
+//! Floor, with K = `(degree + 1)²`: 12 bytes of mean and 12 K of coefficients read per Gaussian
+//! that a camera sees; for every camera 4 read and 12 written of each Gaussian, and about 9 K + 25
+//! operations of each that it sees. Gradients: 12 + 12 K read of each that is seen, and for every
+//! camera 12 and of each that it sees 4; 12 + 12 K written; for every camera about 24 K + 40
+//! operations of each that it sees. Gradients of centres, if wanted, read and compute that once
+//! more.
 
 mod backward;
 
@@ -42,7 +46,8 @@ pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     ]
 }
 
-/// Coefficients of the higher degrees [N, R, 3], as they are stored. All sums are of single precision.
+/// Coefficients of the higher degrees [N, R, 3], as they are stored. All sums are of single
+/// precision.
 #[derive(Clone, Debug)]
 pub enum ShRest {
     /// In single precision.
@@ -149,7 +154,8 @@ fn is_seen(packed: &[f32], index: usize, #[comptime] asked: bool) -> bool {
     }
 }
 
-/// The colour before the clamp. Fused multiply-adds are spelled out, so that the gradient finds the same sign.
+/// The colour before the clamp. Fused multiply-adds are spelled out, so that the gradient finds the
+/// same sign.
 #[cube]
 fn unclamped<R: Float>(
     sh0: &[f32],
@@ -212,7 +218,8 @@ fn sh_colors_forward<R: Float>(
     }
 }
 
-/// Colours [C, N, 3]. The degree is cut to [`SH_DEGREE_MAX`](splat_core::SH_DEGREE_MAX) and to what is stored.
+/// Colours [C, N, 3]. The degree is cut to [`SH_DEGREE_MAX`](splat_core::SH_DEGREE_MAX) and to what
+/// is stored.
 pub fn sh_colors(client: &Client, inputs: &ShColorInputs, settings: ShColorSettings) -> Buffer {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
     let colors = Buffer::empty(client, cameras * gaussians * 3);

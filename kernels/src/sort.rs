@@ -1,9 +1,10 @@
 //! Stable least-significant-digit radix sort of (`u32` key, `u32` value) pairs, any length.
 //!
-//! A few bits a pass, three steps each: count the digits of every block, scan the counts digit by digit over all blocks,
-//! move every pair to its place. Where the device has planes of one known size, ranks come from ballots and a plane's
-//! lane d counts digit d in a register: as many digits as lanes. Elsewhere ranks come from counters of every unit in
-//! shared memory, scanned in the order (digit, unit). Both give the one order that a stable sort has.
+//! A few bits a pass, three steps each: count the digits of every block, scan the counts digit by
+//! digit over all blocks, move every pair to its place. Where the device has planes of one known
+//! size, ranks come from ballots and a plane's lane d counts digit d in a register: as many digits
+//! as lanes. Elsewhere ranks come from counters of every unit in shared memory, scanned in the
+//! order (digit, unit). Both give the one order that a stable sort has.
 //!
 //! Floor per pair and pass: 12 bytes read (the key twice), 8 written.
 
@@ -15,7 +16,8 @@ use crate::launch::{Buffer, cube_count, per_element};
 use crate::planes::plane_size;
 use crate::scan::{cube_exclusive_sum, exclusive_sum};
 
-/// Units of a workgroup: 16 counters of each fit well into the 16 KiB of shared memory that every device has.
+/// Units of a workgroup: 16 counters of each fit well into the 16 KiB of shared memory that every
+/// device has.
 const UNITS: u32 = 128;
 const UNITS_USIZE: usize = UNITS as usize;
 /// Pairs of one unit.
@@ -56,14 +58,15 @@ impl Ranking {
     }
 }
 
-/// Which of the bins the pass at `shift` puts `key` in; `mask` leaves out bits that are not to be sorted by.
+/// Which of the bins the pass at `shift` puts `key` in; `mask` leaves out bits that are not to be
+/// sorted by.
 #[cube]
 fn digit_of(key: u32, shift: u32, mask: u32) -> u32 {
     (key >> shift) & mask
 }
 
-/// `counts[digit * blocks + block]` = keys of `block` with that digit. `len[at]`: how many pairs there are,
-/// if not more than `most`.
+/// `counts[digit * blocks + block]` = keys of `block` with that digit. `len[at]`: how many pairs
+/// there are, if not more than `most`.
 #[cube(launch)]
 fn count_digits(
     keys: &[u32],
@@ -95,8 +98,8 @@ fn count_digits(
     }
 }
 
-/// Place in the keys of a unit's item. A unit without a plane takes consecutive pairs; the lanes of a plane take pairs
-/// beside each other.
+/// Place in the keys of a unit's item. A unit without a plane takes consecutive pairs; the lanes of
+/// a plane take pairs beside each other.
 #[cube]
 fn place(item: usize, #[comptime] ranking: Ranking) -> usize {
     let lanes = comptime!(ranking.lanes);
@@ -116,8 +119,8 @@ fn lanes_with(digit: u32, ballots: &Array<u32>, valid: u32, #[comptime] bits: us
     lanes
 }
 
-/// Ranks of a unit's pairs among those of the same digit in its plane, and how often the digit that is the unit's lane
-/// occurs in the plane. All units of a plane must call it together.
+/// Ranks of a unit's pairs among those of the same digit in its plane, and how often the digit that
+/// is the unit's lane occurs in the plane. All units of a plane must call it together.
 #[cube]
 fn rank_by_planes(
     keys: &[u32],
@@ -165,8 +168,8 @@ fn rank_by_planes(
     counted
 }
 
-/// Moves every pair to `starts[digit, block]` + its rank among the block's pairs with that digit. `len[at]`: how many
-/// pairs there are, if not more than `most`.
+/// Moves every pair to `starts[digit, block]` + its rank among the block's pairs with that digit.
+/// `len[at]`: how many pairs there are, if not more than `most`.
 #[cube(launch)]
 fn scatter(
     keys: &[u32],
@@ -185,7 +188,8 @@ fn scatter(
     let digits = comptime!(ranking.digits());
     let parts = comptime!(ranking.parts());
     let lanes = comptime!(ranking.lanes);
-    // For every digit and part: first how often it occurs there, then how often in the block before that.
+    // For every digit and part: first how often it occurs there, then how often in the block before
+    // that.
     let mut before = Shared::new_slice(comptime!(digits * parts));
     let mut shared = Shared::new_slice(UNITS_USIZE);
     // Occurrences in the block of all lower digits.
@@ -300,8 +304,8 @@ pub fn iota(client: &Client, len: usize) -> Buffer {
     values
 }
 
-/// Sorts the pairs by the lowest `key_bits` bits of their keys, ascending; pairs of equal keys keep their order.
-/// Pairs without a partner (one buffer longer than the other) are dropped.
+/// Sorts the pairs by the lowest `key_bits` bits of their keys, ascending; pairs of equal keys keep
+/// their order. Pairs without a partner (one buffer longer than the other) are dropped.
 pub fn sort_pairs(
     client: &Client,
     keys: &Buffer,
@@ -313,8 +317,8 @@ pub fn sort_pairs(
     sort_first_pairs(client, keys, values, (&count, 0), key_bits)
 }
 
-/// Sorts the first pairs, as many as element `count.1` of `count.0` says; what is behind them in the results is not
-/// defined. The host need not know how many they are.
+/// Sorts the first pairs, as many as element `count.1` of `count.0` says; what is behind them in
+/// the results is not defined. The host need not know how many they are.
 pub(crate) fn sort_first_pairs(
     client: &Client,
     keys: &Buffer,
@@ -381,8 +385,8 @@ pub fn bits_for(count: usize) -> u32 {
     usize::BITS - count.saturating_sub(1).leading_zeros()
 }
 
-/// The bits of a float, changed so that unsigned order is numerical order: negative ones are flipped whole, the others
-/// in the sign only. -0 counts as 0.
+/// The bits of a float, changed so that unsigned order is numerical order: negative ones are
+/// flipped whole, the others in the sign only. -0 counts as 0.
 #[cube]
 pub(crate) fn ordered_bits(value: f32) -> u32 {
     let mut bits = u32::reinterpret(value);

@@ -1,16 +1,17 @@
-//! Structural similarity of two images (Wang et al. 2004) and its gradient, two launches each: a separable window along
-//! the rows, then down the columns.
+//! Structural similarity of two images (Wang et al. 2004) and its gradient, two launches each: a
+//! separable window along the rows, then down the columns.
 //!
 //! ```text
 //! S = A C / (B D),  A = 2 mx my + c1,  B = mx² + my² + c1,  C = 2 (p - mx my) + c2,  D = q - mx² - my² + c2
 //! dS/dmx = 2 my (C - A) / (B D) + 2 mx S (1/D - 1/B),   dS/dq = -S / D,   dS/dp = 2 A / (B D)
 //! dL/dx = blur(g dS/dmx) + 2 x blur(g dS/dq) + y blur(g dS/dp)
 //! ```
-//! mx, my, q, p: windowed means of x, y, x² + y², xy. A unit makes eight neighbouring values of each, so that what it
-//! reads serves several of them: with the window of 11, 18 reads instead of 88.
+//! mx, my, q, p: windowed means of x, y, x² + y², xy. A unit makes eight neighbouring values of
+//! each, so that what it reads serves several of them: with the window of 11, 18 reads instead of
+//! 88.
 //!
-//! Floor per pixel and channel. Forward: 8 bytes read, 4 written, and 16 written to be kept; 2 x 4 x 11 fused
-//! multiply-adds. Gradient: 28 bytes read, 4 written; 2 x 3 x 11 fused multiply-adds.
+//! Floor per pixel and channel. Forward: 8 bytes read, 4 written, and 16 written to be kept; 2 x 4
+//! x 11 fused multiply-adds. Gradient: 28 bytes read, 4 written; 2 x 3 x 11 fused multiply-adds.
 
 mod kernels;
 
@@ -46,7 +47,8 @@ impl SsimShape {
     }
 }
 
-/// The values that lie behind each other along one axis: `lines` lines of `size`; neighbours are `stride` apart.
+/// The values that lie behind each other along one axis: `lines` lines of `size`; neighbours are
+/// `stride` apart.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 struct Axis {
@@ -83,7 +85,8 @@ impl SsimShape {
     }
 }
 
-/// S of every value of `images` (x, y, both [B, H, W, D]), and mx, my, q, p [4, B, H, W, D] for the gradient.
+/// S of every value of `images` (x, y, both [B, H, W, D]), and mx, my, q, p [4, B, H, W, D] for the
+/// gradient.
 pub fn ssim(
     client: &Client,
     images: [&Buffer; 2],
@@ -128,7 +131,8 @@ pub fn ssim(
     (map, moments)
 }
 
-/// Gradients of both images for the gradient `grad` of S [B, H, W, D]; only those that `needs_grad` names.
+/// Gradients of both images for the gradient `grad` of S [B, H, W, D]; only those that `needs_grad`
+/// names.
 pub fn ssim_vjp(
     client: &Client,
     images: [&Buffer; 2],

@@ -65,8 +65,9 @@ fn floors_are_the_bytes_of_inputs_and_results() {
         written: n * 4 * 2,
     };
     assert_eq!(floors["density"], density);
-    // Of an intersection: its number, its slot, six of shape, colour; then its nine sums and again; of a pixel the
-    // gradient of colour and alpha, what is left, what was walked; of a Gaussian all of its gradients.
+    // Of an intersection: its number, its slot, six of shape, colour; then its nine sums and again;
+    // of a pixel the gradient of colour and alpha, what is left, what was walked; of a Gaussian all
+    // of its gradients.
     let backward = Bytes {
         read: i * 4 * (2 + 6 + 3) + i * 4 * 9 + pixels * 4 * (4 + 2),
         written: i * 4 * 9 + n * 4 * (9 + 3 + 1),

@@ -1,4 +1,5 @@
-//! Memory, by the allocator's own count, and its bandwidth: in a process of its own, because the count is of all.
+//! Memory, by the allocator's own count, and its bandwidth: in a process of its own, because the
+//! count is of all.
 
 #[path = "kernels/adapter.rs"]
 mod adapter;
@@ -71,7 +72,8 @@ fn a_picture_keeps_the_bytes_that_are_stated() {
                 &client, &inputs, &state, &image, &frames, &settings, needs_grad,
             );
             let reserved = work().reserved_bytes - before;
-            // Gradients of nine floats of a packed splat, one colour and the opacity; and what stands for a missing input.
+            // Gradients of nine floats of a packed splat, one colour and the opacity; and what
+            // stands for a missing input.
             let stated = 44 * splats as u64
                 + Kept::gradient_per_intersection(1, sums) * state.lists.intersections as u64;
             println!("gradient: {reserved} bytes, stated {stated}");

@@ -1,4 +1,5 @@
-//! The kernels that use plane operations, by the tests of `kernels/`. A process of its own: the choice is for all.
+//! The kernels that use plane operations, by the tests of `kernels/`. A process of its own: the
+//! choice is for all.
 
 #[path = "kernels/adapter.rs"]
 mod adapter;

@@ -1,4 +1,5 @@
-//! What is counted for the whole process, and what depends on calls before: alone in its process, one after the other.
+//! What is counted for the whole process, and what depends on calls before: alone in its process,
+//! one after the other.
 
 #[path = "kernels/adapter.rs"]
 mod adapter;

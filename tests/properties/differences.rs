@@ -1,8 +1,9 @@
-//! The gradient of each op by itself against central differences in double precision: `splat_lab::central`, along random
-//! directions over each input.
+//! The gradient of each op by itself against central differences in double precision:
+//! `splat_lab::central`, along random directions over each input.
 //!
-//! The ops are smooth but where they decide: culled or not, clamped or not, below the cut of alpha, at its cap, stopped. Steps
-//! shrink until no decision changes on them. The last test counts the decisions.
+//! The ops are smooth but where they decide: culled or not, clamped or not, below the cut of alpha,
+//! at its cap, stopped. Steps shrink until no decision changes on them. The last test counts the
+//! decisions.
 
 use burn::tensor::Tensor;
 use burn_splat::ops::{
@@ -16,9 +17,11 @@ use splat_lab::central::{CheckError, Coverage, Report, Settings, gradcheck_with,
 use super::scene::{COEFFS, SIZE, Scene, host, rotations, rows, scenes, thresholds, vectors};
 use super::support::{config, weights};
 
-/// Gate on the difference of derivatives along a direction, relative to the root of the sum of squares of its elements'.
+/// Gate on the difference of derivatives along a direction, relative to the root of the sum of
+/// squares of its elements'.
 const GATE: f64 = 1e-7;
-/// The largest error at a single element that may go unseen, in units of the root mean square derivative. Measured: 3e-6.
+/// The largest error at a single element that may go unseen, in units of the root mean square
+/// derivative. Measured: 3e-6.
 const UNSEEN: f64 = 1e-5;
 /// Per tensor; together they find any error that is not orthogonal to all of them.
 const DIRECTIONS: usize = 4;
@@ -120,8 +123,8 @@ fn run_rasterize(
         .packed()
 }
 
-/// Columns of the screen splats that are differentiated: mean and inverse Cholesky factor. Depth and extents only order and
-/// cull, the compensation is not read.
+/// Columns of the screen splats that are differentiated: mean and inverse Cholesky factor. Depth
+/// and extents only order and cull, the compensation is not read.
 fn differentiated(packed: &Tensor<3>) -> Tensor<3> {
     let columns = |start, length| packed.clone().narrow(2, start, length);
     Tensor::cat(vec![columns(0, 2), columns(3, 3)], 2)

@@ -1,9 +1,10 @@
-//! The program's allocator, which says in one line that there is no memory left. Without it the process aborts with a
-//! backtrace of nobody's interest.
+//! The program's allocator, which says in one line that there is no memory left. Without it the
+//! process aborts with a backtrace of nobody's interest.
 
 use std::alloc::{GlobalAlloc, Layout};
 
-/// An allocator whose failure ends the process in words, with the exit status of what cannot be done.
+/// An allocator whose failure ends the process in words, with the exit status of what cannot be
+/// done.
 pub struct OrSay<A>(pub A);
 
 // SAFETY: what the inner allocator promises; where it gives nothing, nothing is given.

@@ -16,7 +16,8 @@ pub enum DeviceChoice {
     Cpu,
     /// Vulkan, Metal, DirectX or WebGPU, software adapters included
     Wgpu,
-    /// The same through SPIR-V, faster on GPUs with Vulkan; in a program built with the feature `vulkan`
+    /// The same through SPIR-V, faster on GPUs with Vulkan; in a program built with the feature
+    /// `vulkan`
     Vulkan,
     /// CUDA; in a program built with the feature `cuda`
     Cuda,
@@ -42,7 +43,8 @@ pub(super) struct ChosenDevice {
 }
 
 impl ChosenDevice {
-    /// Its name, and of a CubeCL device what decides which variants of the kernels run, and which these are.
+    /// Its name, and of a CubeCL device what decides which variants of the kernels run, and which
+    /// these are.
     fn in_words(&self) -> String {
         let facts = device_info(&self.device).unwrap_or_default();
         let told = ["runtime", "planes", "atomic addition", "rasterize", "sort"];
@@ -74,7 +76,8 @@ pub(super) fn open(global: &GlobalArgs) -> Result<ChosenDevice, Failure> {
     Ok(chosen)
 }
 
-/// Whether a device is known to crash in its driver, where nothing can be caught: all that helps is to say so before.
+/// Whether a device is known to crash in its driver, where nothing can be caught: all that helps is
+/// to say so before.
 fn may_crash(facts: &[(&'static str, String)]) -> bool {
     let has = |name, part| {
         facts
@@ -97,8 +100,8 @@ fn cpu() -> Result<ChosenDevice, Failure> {
     Err(not_built("cpu"))
 }
 
-/// The first adapter that is a GPU. Software adapters (lavapipe, llvmpipe, WARP) call themselves a CPU and are left
-/// out: our own CPU path is many times faster.
+/// The first adapter that is a GPU. Software adapters (lavapipe, llvmpipe, WARP) call themselves a
+/// CPU and are left out: our own CPU path is many times faster.
 #[cfg(feature = "wgpu")]
 fn real_gpu() -> Option<ChosenDevice> {
     use burn::tensor::DeviceKind;

@@ -163,7 +163,8 @@ fn pictures(
     Ok(pictures)
 }
 
-/// Accumulated depth `sum(z alpha T)`, `[1, H, W, 1]`: the depths rasterised as if they were a colour.
+/// Accumulated depth `sum(z alpha T)`, `[1, H, W, 1]`: the depths rasterised as if they were a
+/// colour.
 fn accumulated_depth(
     gaussians: &Gaussians,
     projected: &Projected,

@@ -15,13 +15,15 @@ pub enum PrecisionChoice {
     /// Single precision
     #[default]
     Exact,
-    /// The higher degrees in half precision, on devices that read it: less memory; docs/GPU.md has the error
+    /// The higher degrees in half precision, on devices that read it: less memory; docs/GPU.md has
+    /// the error
     Half,
 }
 
-/// Reads a scene, and how it must be rendered: as its file says. Files of earlier versions, and of other programs, do
-/// not say whether it was trained with anti-aliasing or in front of a background; of those, and only of those, the
-/// run's `config.toml` beside the file is asked, if there is one.
+/// Reads a scene, and how it must be rendered: as its file says. Files of earlier versions, and of
+/// other programs, do not say whether it was trained with anti-aliasing or in front of a
+/// background; of those, and only of those, the run's `config.toml` beside the file is asked, if
+/// there is one.
 pub(super) fn open(
     path: &Path,
     device: &Device,
@@ -46,7 +48,8 @@ pub(super) fn open(
     Ok((gaussians, RenderSettings::of_scene(&data)))
 }
 
-/// Takes what the scene does not say from the `config.toml` beside it. One that is not a run's is passed over.
+/// Takes what the scene does not say from the `config.toml` beside it. One that is not a run's is
+/// passed over.
 fn ask_config(scene: &Path, settings: &mut SceneSettings, global: &GlobalArgs) {
     let path = scene.with_file_name("config.toml");
     let says_all = settings.antialias.is_some() && settings.background.is_some();

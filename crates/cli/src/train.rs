@@ -58,8 +58,8 @@ pub struct TrainArgs {
     /// Density control
     #[arg(long, value_enum, default_value_t)]
     pub strategy: Strategy,
-    /// No growth beyond this many Gaussians [default: seven for every ten pixels of a photo, or one for every hundred
-    /// of all photos, whichever is more]
+    /// No growth beyond this many Gaussians [default: seven for every ten pixels of a photo, or one
+    /// for every hundred of all photos, whichever is more]
     #[arg(long, value_name = "N")]
     pub max_gaussians: Option<usize>,
     /// Settings, such as the config.toml of another run; arguments win over it
@@ -82,7 +82,8 @@ pub enum Strategy {
 }
 
 impl TrainArgs {
-    /// The run's settings: the file's (or the interrupted run's, or the defaults), then the arguments'.
+    /// The run's settings: the file's (or the interrupted run's, or the defaults), then the
+    /// arguments'.
     fn config(
         &self,
         resumed: Option<&Interrupted>,

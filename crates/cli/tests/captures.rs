@@ -1,4 +1,5 @@
-//! Captures as the `splat` program meets them: photos in a folder of another name, and views whose pictures would share one.
+//! Captures as the `splat` program meets them: photos in a folder of another name, and views whose
+//! pictures would share one.
 #![cfg(feature = "cpu")]
 
 use std::collections::BTreeSet;

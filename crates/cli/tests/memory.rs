@@ -1,4 +1,5 @@
-//! What memory cannot hold is refused in one line; an allocation that failed would end the process without a word.
+//! What memory cannot hold is refused in one line; an allocation that failed would end the process
+//! without a word.
 #![cfg(all(feature = "cpu", target_os = "linux"))]
 
 use std::path::Path;

@@ -1,4 +1,5 @@
-//! The `splat` program as its users meet it: what it leaves, that it repeats itself, and what it says to bad input.
+//! The `splat` program as its users meet it: what it leaves, that it repeats itself, and what it
+//! says to bad input.
 #![cfg(feature = "cpu")]
 
 #[path = "program/runs.rs"]
@@ -65,7 +66,8 @@ fn training_leaves_everything_and_repeats_itself_bit_for_bit() {
     let folder = TempDir::new().unwrap();
     let capture = example(folder.path());
     let outs = ["a", "b", "other_seed"].map(|name| folder.path().join(name));
-    // 300 steps reach the first refinement, so cloning, splitting and pruning are in the comparison.
+    // 300 steps reach the first refinement, so cloning, splitting and pruning are in the
+    // comparison.
     succeed(&train(
         &capture,
         &outs[0],

@@ -1,5 +1,5 @@
-//! The laboratory: checks gradients against PyTorch and central differences, measures accuracy on hard cases and the
-//! performance of a training step.
+//! The laboratory: checks gradients against PyTorch and central differences, measures accuracy on
+//! hard cases and the performance of a training step.
 
 #[cfg(feature = "cpu")]
 pub mod accuracy;

@@ -1,5 +1,5 @@
-//! Training on a CubeCL device: the same bits however often it is repeated, and the memory that is stated. In a process of
-//! its own, one test after the other, because the allocator counts for all.
+//! Training on a CubeCL device: the same bits however often it is repeated, and the memory that is
+//! stated. In a process of its own, one test after the other, because the allocator counts for all.
 #![cfg(all(feature = "cpu", feature = "wgpu"))]
 
 use std::path::Path;
@@ -171,6 +171,7 @@ fn the_state_between_steps_takes_the_bytes_that_are_stated() {
     println!("{small:?}\n{large:?}\nper Gaussian: {at_rest} at rest, {most} in a step");
     // Nothing else grows with the Gaussians; a few bytes of alignment are not counted.
     assert!((at_rest / PER_GAUSSIAN_AT_REST as f64 - 1.0).abs() < 0.01);
-    // In a step come the gradients, 236 bytes, what is projected, 36, colours, and the rest of what is kept for them.
+    // In a step come the gradients, 236 bytes, what is projected, 36, colours, and the rest of what
+    // is kept for them.
     assert!(most > at_rest + 236.0, "{most}");
 }

@@ -1,5 +1,5 @@
-//! Constants, layouts and settings that the kernels, the ops and the file readers agree on, and how much memory there is.
-//! No dependencies.
+//! Constants, layouts and settings that the kernels, the ops and the file readers agree on, and how
+//! much memory there is. No dependencies.
 
 pub mod exp;
 pub mod memory;

@@ -1,5 +1,5 @@
-//! Memory that this process can still get, so that work which needs more is refused in words: an allocation that fails
-//! ends the process.
+//! Memory that this process can still get, so that work which needs more is refused in words: an
+//! allocation that fails ends the process.
 
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -9,14 +9,15 @@ use std::time::{Duration, Instant};
 const FRESH: Duration = Duration::from_secs(1);
 /// A need of more than this share of the memory left is worth measuring again.
 const LARGE_SHARE: u64 = 4;
-/// A share of the memory left is not counted on: what lies between large allocations may be too small for the next.
+/// A share of the memory left is not counted on: what lies between large allocations may be too
+/// small for the next.
 const SLACK_SHARE: u64 = 8;
 /// Left alone for everything else that allocates meanwhile.
 const RESERVE: u64 = 128 << 20;
 
-/// Bytes that this process can still allocate: the least of what the system has left, of what the control groups it is in
-/// may still use, and of what its own limits (`ulimit -v`, `ulimit -d`) leave. None where the system does not say, which
-/// is every system but Linux.
+/// Bytes that this process can still allocate: the least of what the system has left, of what the
+/// control groups it is in may still use, and of what its own limits (`ulimit -v`, `ulimit -d`)
+/// leave. None where the system does not say, which is every system but Linux.
 pub fn available_memory() -> Option<u64> {
     let read = |path: &Path| std::fs::read_to_string(path).ok();
     let proc = |file: &str| read(&Path::new("/proc").join(file));
@@ -35,8 +36,9 @@ pub fn available_memory() -> Option<u64> {
     .min()
 }
 
-/// The memory that can be counted on, if `needed` bytes are more than that. What needs little of it does not measure anew
-/// every time, and what needs next to nothing is not asked for: a moment's shortage should not end a run.
+/// The memory that can be counted on, if `needed` bytes are more than that. What needs little of it
+/// does not measure anew every time, and what needs next to nothing is not asked for: a moment's
+/// shortage should not end a run.
 pub fn lacking(needed: u64) -> Option<u64> {
     if needed <= RESERVE / 2 {
         return None;
@@ -63,8 +65,8 @@ pub fn in_units(bytes: u64) -> String {
     }
 }
 
-/// Address space of a process that is in use, from its `status`. `VmSize` and `VmData` have more: what an allocator has
-/// reserved for itself and not touched, which it will hand out.
+/// Address space of a process that is in use, from its `status`. `VmSize` and `VmData` have more:
+/// what an allocator has reserved for itself and not touched, which it will hand out.
 fn mapped(status: &str) -> Option<u64> {
     let parts = ["RssAnon:", "VmStk:", "VmExe:", "VmLib:"];
     parts.iter().map(|part| kilobytes(status, part)).sum()
@@ -87,7 +89,8 @@ fn limit(limits: &str, name: &str) -> Option<u64> {
     line.split_whitespace().next()?.parse().ok()
 }
 
-/// Memory that the control groups of this process (`/proc/self/cgroup`), and those that they are in, may still use.
+/// Memory that the control groups of this process (`/proc/self/cgroup`), and those that they are
+/// in, may still use.
 fn left_in_groups(groups: &str, read: &dyn Fn(&Path) -> Option<String>) -> Option<u64> {
     let left = groups.lines().filter_map(|line| {
         let [_, controllers, path] = line.splitn(3, ':').collect::<Vec<_>>().try_into().ok()?;
@@ -117,7 +120,8 @@ fn left_in_groups(groups: &str, read: &dyn Fn(&Path) -> Option<String>) -> Optio
     left.min()
 }
 
-/// Memory that one group may still use: its limit less its use, of which files that were read are given back when needed.
+/// Memory that one group may still use: its limit less its use, of which files that were read are
+/// given back when needed.
 fn left_in_group(
     folder: PathBuf,
     [max, current, files]: [&str; 3],

@@ -1,8 +1,9 @@
 //! Layout of the packed splats that `project` writes and `rasterize` reads.
 //!
 //! # Culling
-//! A row of zeros is a culled splat. A splat is kept when its depth lies in `[near, far]`, its quaternion has a length,
-//! all of its fields are finite, and its box overlaps the image, borders excluded:
+//! A row of zeros is a culled splat. A splat is kept when its depth lies in `[near, far]`, its
+//! quaternion has a length, all of its fields are finite, and its box overlaps the image, borders
+//! excluded:
 //!
 //! ```text
 //! mean_x + extent_x > 0,  mean_x - extent_x < width,  mean_y + extent_y > 0,  mean_y - extent_y < height

@@ -44,18 +44,21 @@ impl Default for ProjectSettings {
 /// Settings of `rasterize`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RasterizeSettings {
-    /// A splat is skipped at a pixel where its alpha is below this, which is above 0. Default 1/255 (3DGS appendix C).
+    /// A splat is skipped at a pixel where its alpha is below this, which is above 0. Default 1/255
+    /// (3DGS appendix C).
     pub alpha_min: f64,
-    /// Alpha is capped here, below 1; the gradient through a capped alpha is zero. Default 0.99 (3DGS appendix C).
+    /// Alpha is capped here, below 1; the gradient through a capped alpha is zero. Default 0.99
+    /// (3DGS appendix C).
     pub alpha_max: f64,
-    /// A pixel stops before its transmittance would fall below this; never, if it is 0. Default 9.999e-5: the 1e-4 of
-    /// 3DGS appendix C less one part in 10,000, because two splats at the cap leave exactly 1e-4,
-    /// which rounds to either side.
+    /// A pixel stops before its transmittance would fall below this; never, if it is 0. Default
+    /// 9.999e-5: the 1e-4 of 3DGS appendix C less one part in 10,000, because two splats at the cap
+    /// leave exactly 1e-4, which rounds to either side.
     pub transmittance_min: f64,
-    /// Whether the same input gives the same gradients, bit for bit, every time. Default true. False, on a CubeCL device:
-    /// the tiles' shares of a splat's gradient are added up as they come, which differs from run to run in the last digits.
-    /// It saves memory, 24 bytes and 4 per channel of each intersection in the backward pass, and from the forward
-    /// pass on 4 of each and 12 of each Gaussian and camera; docs/GPU.md has what it does to the time. The CPU sums
+    /// Whether the same input gives the same gradients, bit for bit, every time. Default true.
+    /// False, on a CubeCL device: the tiles' shares of a splat's gradient are added up as they
+    /// come, which differs from run to run in the last digits. It saves memory, 24 bytes and 4 per
+    /// channel of each intersection in the backward pass, and from the forward pass on 4 of each
+    /// and 12 of each Gaussian and camera; docs/GPU.md has what it does to the time. The CPU sums
     /// in order in any case.
     pub deterministic: bool,
 }
@@ -77,8 +80,9 @@ pub enum ClampGradient {
     /// The derivative: nothing passes below zero.
     #[default]
     Exact,
-    /// The derivative, and below zero also a gradient whose descent raises the channel. A channel that has slipped
-    /// below zero in every view would otherwise stay black for good, since nothing could ever reach it. For training.
+    /// The derivative, and below zero also a gradient whose descent raises the channel. A channel
+    /// that has slipped below zero in every view would otherwise stay black for good, since nothing
+    /// could ever reach it. For training.
     Recovering,
 }
 
@@ -130,9 +134,10 @@ pub enum AdamRows {
     /// All, as Adam is defined: where the gradient is zero, moments decay and parameters drift on.
     #[default]
     All,
-    /// Those whose gradient is not all zero, NaN counting as zero; the others keep parameter and moments, as if the step
-    /// had not been for them (the sparse Adam of Mallick et al. 2024, *Taming 3DGS*; `SelectiveAdam` of gsplat). Another
-    /// optimiser with other results, and faster where most Gaussians are out of view.
+    /// Those whose gradient is not all zero, NaN counting as zero; the others keep parameter and
+    /// moments, as if the step had not been for them (the sparse Adam of Mallick et al. 2024,
+    /// *Taming 3DGS*; `SelectiveAdam` of gsplat). Another optimiser with other results, and faster
+    /// where most Gaussians are out of view.
     Seen,
 }
 

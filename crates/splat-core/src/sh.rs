@@ -1,6 +1,7 @@
 //! Real spherical harmonics in the basis of 3DGS.
 //!
-//! Each constant is written as the shortest decimal that names its float of double precision; single precision rounds it.
+//! Each constant is written as the shortest decimal that names its float of double precision;
+//! single precision rounds it.
 
 /// Highest degree of spherical harmonics.
 pub const SH_DEGREE_MAX: usize = 3;
@@ -18,8 +19,8 @@ pub const SH_C2: [f64; 3] = [
     0.546_274_215_296_039_6,
 ];
 
-/// Factors of the functions of degree 3: of y (3 xx - yy) and x (xx - 3 yy); of xyz; of y and x (4 zz - xx - yy);
-/// of z (2 zz - 3 xx - 3 yy); of z (xx - yy).
+/// Factors of the functions of degree 3: of y (3 xx - yy) and x (xx - 3 yy); of xyz; of y and x (4
+/// zz - xx - yy); of z (2 zz - 3 xx - 3 yy); of z (xx - yy).
 pub const SH_C3: [f64; 5] = [
     0.590_043_589_926_643_5,
     2.890_611_442_640_554,

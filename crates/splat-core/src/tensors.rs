@@ -1,7 +1,8 @@
 //! The tensors of each op by name, the same from the public op to the kernel.
 //!
-//! One struct serves for the inputs of an op (of tensors), for their gradients (of options), and for which of these are
-//! needed (of `bool`). Inputs that may be absent have a type of their own, `O`.
+//! One struct serves for the inputs of an op (of tensors), for their gradients (of options), and
+//! for which of these are needed (of `bool`). Inputs that may be absent have a type of their own,
+//! `O`.
 
 /// A struct of tensors, and what is done to all of them at once.
 macro_rules! tensors {
@@ -142,7 +143,8 @@ tensors! {
     } optional {
         /// Coefficients of the higher degrees `[N, R, 3]`; absent at degree 0.
         sh_rest,
-        /// Packed splats `[C, N, 9]`, of which those without an extent have no colour. Never has a gradient.
+        /// Packed splats `[C, N, 9]`, of which those without an extent have no colour. Never has a
+        /// gradient.
         seen,
     }
 }

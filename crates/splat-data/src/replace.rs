@@ -1,4 +1,5 @@
-//! Files that are written whole or not at all, and whether a place can be written to, asked before long work.
+//! Files that are written whole or not at all, and whether a place can be written to, asked before
+//! long work.
 
 use std::io::{Error, ErrorKind, Write};
 use std::path::{Path, PathBuf};
@@ -13,8 +14,8 @@ pub struct WriteError {
     pub source: Error,
 }
 
-/// Replaces the file `path` by `contents`; folders on the way are made. After a crash of the machine it may be empty:
-/// for what can be made again. A device or a pipe is written to.
+/// Replaces the file `path` by `contents`; folders on the way are made. After a crash of the
+/// machine it may be empty: for what can be made again. A device or a pipe is written to.
 ///
 /// # Errors
 ///
@@ -23,9 +24,10 @@ pub fn write_atomically(path: &Path, contents: &[u8]) -> std::io::Result<()> {
     replace(path, contents, false)
 }
 
-/// [`write_atomically`] for what cannot be made again. The disk has the new file before it loses the old one, so that
-/// also a crash of the machine leaves one of them. The price is to wait for the disk: measured on that of a virtual
-/// machine, 1 to 5 ms for a small file, 0.16 s for 100 MB, 1.6 s for 500 MB (the checkpoint of 700,000 Gaussians).
+/// [`write_atomically`] for what cannot be made again. The disk has the new file before it loses
+/// the old one, so that also a crash of the machine leaves one of them. The price is to wait for
+/// the disk: measured on that of a virtual machine, 1 to 5 ms for a small file, 0.16 s for 100 MB,
+/// 1.6 s for 500 MB (the checkpoint of 700,000 Gaussians).
 ///
 /// # Errors
 ///
@@ -62,7 +64,8 @@ fn replace(path: &Path, contents: &[u8], durably: bool) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Tries whether files can be written to `folder`, which is made if need be: with a file that is removed again.
+/// Tries whether files can be written to `folder`, which is made if need be: with a file that is
+/// removed again.
 ///
 /// # Errors
 ///
@@ -122,10 +125,12 @@ pub fn probe_files<'a>(
         .try_for_each(|path| probe_file(path))
 }
 
-/// Whether this is a pipe, a terminal, or another thing that is written to and never replaced, such as `/dev/stdout`.
+/// Whether this is a pipe, a terminal, or another thing that is written to and never replaced, such
+/// as `/dev/stdout`.
 fn is_device(path: &Path) -> bool {
     let special = |kind: std::fs::Metadata| !kind.is_file() && !kind.is_dir();
-    // What is there may lead to a file, which then is not to be replaced either. `/dev/shm` is a folder like others.
+    // What is there may lead to a file, which then is not to be replaced either. `/dev/shm` is a
+    // folder like others.
     let devices = ["/dev", "/dev/fd"].map(|folder| Some(Path::new(folder)));
     let device = cfg!(unix) && devices.contains(&path.parent()) && path.exists() && !path.is_dir();
     device || std::fs::metadata(path).is_ok_and(special)

@@ -1,7 +1,9 @@
-//! The size of a scene: the one length that every other length of training, rendering and checks follows.
+//! The size of a scene: the one length that every other length of training, rendering and checks
+//! follows.
 //!
-//! A capture has no unit: structure from motion leaves the scale open, and the same photos come in metres, millimetres
-//! or anything else. So no length may be a constant. Those that there are, and what they follow:
+//! A capture has no unit: structure from motion leaves the scale open, and the same photos come in
+//! metres, millimetres or anything else. So no length may be a constant. Those that there are, and
+//! what they follow:
 //!
 //! | length | value |
 //! |---|---|
@@ -14,10 +16,12 @@
 //! | thresholds of warnings | distances between the capture's own cameras and points |
 //! | orbit of `splat render` | the spread of the scene's own Gaussians, or else [`SceneScale::length`] |
 //!
-//! Absolute lengths that are left, and why: [`ProjectSettings::near`](splat_core::ProjectSettings::near) and `far` of the
-//! bare op, whose caller knows the unit (0.01 and 1e10, as in gsplat); lengths in pixels (the low-pass filter, the largest
-//! size of a splat), which are the photo's; the sizes that single precision has room for, from 1e-15 to 1e10; and 1, the
-//! size of a scene that has none (one camera in the place of its points).
+//! Absolute lengths that are left, and why:
+//! [`ProjectSettings::near`](splat_core::ProjectSettings::near) and `far` of the bare op, whose
+//! caller knows the unit (0.01 and 1e10, as in gsplat); lengths in pixels (the low-pass filter, the
+//! largest size of a splat), which are the photo's; the sizes that single precision has room for,
+//! from 1e-15 to 1e10; and 1, the size of a scene that has none (one camera in the place of its
+//! points).
 
 use glam::DVec3;
 use splat_core::ProjectSettings;
@@ -30,8 +34,8 @@ use crate::SplatData;
 pub struct SceneScale(f64);
 
 impl SceneScale {
-    /// Share of the scene's size at which the near plane lies. gsplat's 0.01, in whose normalised world cameras are about
-    /// one unit from what they look at.
+    /// Share of the scene's size at which the near plane lies. gsplat's 0.01, in whose normalised
+    /// world cameras are about one unit from what they look at.
     const NEAR: f64 = 0.01;
     /// Sizes of the scene at which the far plane lies (gsplat).
     const FAR: f64 = 1e10;
@@ -42,8 +46,8 @@ impl SceneScale {
     /// So many points tell the distance of a camera.
     const POINTS: usize = 4096;
 
-    /// Sizes that single precision can train: beyond, squares of gradients and of sizes leave its range. Tried from 1e-15
-    /// to 1e9.
+    /// Sizes that single precision can train: beyond, squares of gradients and of sizes leave its
+    /// range. Tried from 1e-15 to 1e9.
     const TRAINABLE: core::ops::RangeInclusive<f64> = 1e-15..=1e10;
 
     /// Whether a scene of this size can be trained and rendered in single precision.
@@ -56,12 +60,13 @@ impl SceneScale {
         (length > 0.0 && length.is_finite()).then_some(Self(length))
     }
 
-    /// The size of a capture: the median over its cameras of each camera's median distance to the points, about the
-    /// distance at which the scene is looked at.
+    /// The size of a capture: the median over its cameras of each camera's median distance to the
+    /// points, about the distance at which the scene is looked at.
     ///
-    /// 3DGS takes 1.1 times the largest distance of a camera from the mean camera, which for cameras all around a scene
-    /// is nearly the same (0.8 to 1.2 times this on seven captures). But one camera that is off makes a maximum
-    /// anything; medians move by a few percent at most when a tenth of the cameras, or of the points, is anywhere at all.
+    /// 3DGS takes 1.1 times the largest distance of a camera from the mean camera, which for
+    /// cameras all around a scene is nearly the same (0.8 to 1.2 times this on seven captures). But
+    /// one camera that is off makes a maximum anything; medians move by a few percent at most when
+    /// a tenth of the cameras, or of the points, is anywhere at all.
     ///
     /// ```
     /// use splat_data::{Camera, ImageSize, SceneScale};
@@ -90,8 +95,8 @@ impl SceneScale {
             .unwrap_or(Self(1.0))
     }
 
-    /// The size of a scene that nothing is known of but its Gaussians: the median distance of the means from their
-    /// median, or where all are in one place the median of their own sizes.
+    /// The size of a scene that nothing is known of but its Gaussians: the median distance of the
+    /// means from their median, or where all are in one place the median of their own sizes.
     pub fn of_splats(splats: &SplatData) -> Self {
         let every = splats.len().div_ceil(Self::POINTS).max(1);
         let means = splats.means.iter().step_by(every);
@@ -132,15 +137,16 @@ impl SceneScale {
         }
     }
 
-    /// Adam's epsilon for the means. It is added to the size of a gradient, which is one over a length: with a constant, a
-    /// scene in a small unit would be trained by other steps than the same scene in a large one.
+    /// Adam's epsilon for the means. It is added to the size of a gradient, which is one over a
+    /// length: with a constant, a scene in a small unit would be trained by other steps than the
+    /// same scene in a large one.
     pub fn means_epsilon(self) -> f64 {
         Self::EPSILON / self.0
     }
 
-    /// Where the means of the scene should count from: the world's zero, unless it is so far away that 32-bit floats
-    /// would round visible detail away; then the median of the cameras, to a power of two below the scene's size (short
-    /// numbers where the scene is large).
+    /// Where the means of the scene should count from: the world's zero, unless it is so far away
+    /// that 32-bit floats would round visible detail away; then the median of the cameras, to a
+    /// power of two below the scene's size (short numbers where the scene is large).
     pub fn origin(self, cameras: &[Camera]) -> [f64; 3] {
         let positions: Vec<DVec3> = cameras.iter().map(Camera::position).collect();
         let middle = middle(&positions);
@@ -198,7 +204,8 @@ mod tests {
         DVec3::from([(); 3].map(|()| rng.random_range(-spread..spread)))
     }
 
-    /// Cameras around a scene, in a row in front of it, and on a walk through it, each with its points.
+    /// Cameras around a scene, in a row in front of it, and on a walk through it, each with its
+    /// points.
     fn captures(rng: &mut Pcg64Mcg) -> [(Vec<DVec3>, Vec<[f64; 3]>); 3] {
         let mut points = |at: DVec3, spread: f64| -> Vec<[f64; 3]> {
             (0..3_000)

@@ -6,7 +6,8 @@ use std::fmt::{self, Display};
 ///
 /// # Errors
 ///
-/// What is wrong, in words, where the bytes are no UTF-8 or ASCII text from the start: UTF-16 most of all.
+/// What is wrong, in words, where the bytes are no UTF-8 or ASCII text from the start: UTF-16 most
+/// of all.
 pub fn without_mark(bytes: &[u8]) -> Result<&[u8], &'static str> {
     if let Some(text) = bytes.strip_prefix(&[0xef, 0xbb, 0xbf]) {
         return Ok(text);
@@ -34,7 +35,8 @@ pub fn one_line(message: &str) -> String {
     message.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// Lines with their index from 0. They end as on Unix or Windows, or as on an old Mac where no other end is found.
+/// Lines with their index from 0. They end as on Unix or Windows, or as on an old Mac where no
+/// other end is found.
 pub fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, &[u8])> {
     let end = if bytes.contains(&b'\n') { b'\n' } else { b'\r' };
     let lines = bytes.split(move |&byte| byte == end);

@@ -1,4 +1,5 @@
-//! The trained parameters of a model, by name: which have a row per Gaussian, and how fast each is trained.
+//! The trained parameters of a model, by name: which have a row per Gaussian, and how fast each is
+//! trained.
 
 use splat_data::SceneScale;
 
@@ -17,20 +18,23 @@ pub const GAUSSIANS: usize = 0;
 /// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Field {
-    /// What strategies and settings call it; no two fields of a model share a name. Every model that the strategies of
-    /// this crate work on has `means`, `log_scales`, `quats` and `opacity_logits`, as [`Gaussians`](crate::Gaussians) has.
+    /// What strategies and settings call it; no two fields of a model share a name. Every model
+    /// that the strategies of this crate work on has `means`, `log_scales`, `quats` and
+    /// `opacity_logits`, as [`Gaussians`](crate::Gaussians) has.
     pub name: String,
-    /// Where Burn finds the parameter in the module: `means`, or `gaussians.means` in a model that is made of one.
+    /// Where Burn finds the parameter in the module: `means`, or `gaussians.means` in a model that
+    /// is made of one.
     pub path: String,
-    /// The row set that its first dimension runs over; none for a parameter without a row per Gaussian, which no edit of
-    /// rows touches. [`GAUSSIANS`] is the set of all; a model may have others, with fewer rows.
+    /// The row set that its first dimension runs over; none for a parameter without a row per
+    /// Gaussian, which no edit of rows touches. [`GAUSSIANS`] is the set of all; a model may have
+    /// others, with fewer rows.
     pub row_set: Option<usize>,
     /// Learning rate at the first step.
     pub rate: f64,
     /// The rate decays exponentially to this share of itself at the last step. 1: it is constant.
     pub final_share: f64,
-    /// Whether values are lengths in world units: then the rate is in units of the scene's size, and Adam's epsilon, one
-    /// over a length, follows it too.
+    /// Whether values are lengths in world units: then the rate is in units of the scene's size,
+    /// and Adam's epsilon, one over a length, follows it too.
     pub is_length: bool,
 }
 

@@ -14,8 +14,8 @@ use splat_data::{SceneSettings, SplatData};
 /// opacities as logits.
 #[derive(Module, Debug)]
 pub struct Gaussians {
-    /// Where in the world the means count from, see [`SplatData::origin`]. Cameras that look at the model must count
-    /// from there too: [`Camera::relative_to`](crate::Camera::relative_to).
+    /// Where in the world the means count from, see [`SplatData::origin`]. Cameras that look at the
+    /// model must count from there too: [`Camera::relative_to`](crate::Camera::relative_to).
     #[module(skip)]
     pub origin: [f64; 3],
     /// Centres relative to the origin, `[N, 3]`, world units.
@@ -28,18 +28,20 @@ pub struct Gaussians {
     pub opacity_logits: Param<Tensor<1>>,
     /// Spherical harmonics of degree 0, `[N, 1, 3]`.
     pub sh0: Param<Tensor<3>>,
-    /// Spherical harmonics of the higher degrees, `[N, (degree + 1)^2 - 1, 3]`; absent for degree 0.
+    /// Spherical harmonics of the higher degrees, `[N, (degree + 1)^2 - 1, 3]`; absent for degree
+    /// 0.
     pub sh_rest: Option<Param<Tensor<3>>>,
 }
 
-/// How the coefficients of the higher degrees of spherical harmonics are stored: 45 of the 59 floats of a Gaussian of
-/// degree 3.
+/// How the coefficients of the higher degrees of spherical harmonics are stored: 45 of the 59
+/// floats of a Gaussian of degree 3.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ShPrecision {
     /// In single precision.
     #[default]
     Exact,
-    /// In half precision, for rendering: 146 bytes for a Gaussian instead of 236, of which colours read 114 instead of
+    /// In half precision, for rendering: 146 bytes for a Gaussian instead of 236, of which colours
+    /// read 114 instead of
     /// 204. `docs/ACCURACY.md` has the error.
     Half,
 }
@@ -104,9 +106,10 @@ impl Gaussians {
         }
     }
 
-    /// The same scene, its higher degrees stored as asked for; from half precision there is no way back. They are
-    /// constants then: a model to be trained stays exact. It also stays as it is where the device's kernels do not read
-    /// half precision (no CPU does it to gain), and where a coefficient is too large for it.
+    /// The same scene, its higher degrees stored as asked for; from half precision there is no way
+    /// back. They are constants then: a model to be trained stays exact. It also stays as it is
+    /// where the device's kernels do not read half precision (no CPU does it to gain), and where a
+    /// coefficient is too large for it.
     #[must_use]
     pub fn with_sh_precision(mut self, precision: ShPrecision) -> Self {
         if let (ShPrecision::Half, Some(rest)) = (precision, &self.sh_rest) {
@@ -156,11 +159,13 @@ impl Gaussians {
         sigmoid(self.opacity_logits.val())
     }
 
-    /// Colours `[C, N, 3]` as cameras with the given centres `[C, 3]` see them, see [`sh_colors`]; only
-    /// of those that were not culled, if what the same cameras have `seen` is given (the others are black).
+    /// Colours `[C, N, 3]` as cameras with the given centres `[C, 3]` see them, see [`sh_colors`];
+    /// only of those that were not culled, if what the same cameras have `seen` is given (the
+    /// others are black).
     ///
     /// # Errors
-    /// When the model has no coefficients of that degree, or the centres or what was seen do not fit.
+    /// When the model has no coefficients of that degree, or the centres or what was seen do not
+    /// fit.
     pub fn colors(
         &self,
         centers: Tensor<2>,

@@ -63,9 +63,9 @@ pub enum InitError {
 /// One Gaussian per point: the point's colour, an isotropic scale of the root mean square of the
 /// distances to its three nearest neighbours, no rotation.
 ///
-/// Everything starts where gradients reach it. Neighbours are points in other places, since points that coincide would
-/// have no size (where all do, `scene` gives it); and a channel of level 0 starts at half a level, above the clamp of
-/// colours at zero.
+/// Everything starts where gradients reach it. Neighbours are points in other places, since points
+/// that coincide would have no size (where all do, `scene` gives it); and a channel of level 0
+/// starts at half a level, above the clamp of colours at zero.
 ///
 /// # Errors
 /// When there is no point or one is not finite.
@@ -107,8 +107,8 @@ pub fn splats_from_points(
     })
 }
 
-/// Per point the root mean square of the distances to the three nearest other places where there are points (fewer where
-/// there are fewer); none where all points are in one place.
+/// Per point the root mean square of the distances to the three nearest other places where there
+/// are points (fewer where there are fewer); none where all points are in one place.
 fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<Option<f64>> {
     const NEIGHBOURS: usize = 3;
     // Zero and minus zero are one place.

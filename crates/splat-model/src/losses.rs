@@ -20,7 +20,8 @@ pub fn psnr(image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
     mse(image.clamp(0.0, 1.0), target.clamp(0.0, 1.0)).log() * (-10.0 / core::f64::consts::LN_10)
 }
 
-/// Settings of structural similarity; the defaults are those of Wang et al. 2004 for images in [0, 1].
+/// Settings of structural similarity; the defaults are those of Wang et al. 2004 for images in [0,
+/// 1].
 #[derive(Debug, Clone, Copy, PartialEq, Setters)]
 #[setters(prefix = "with_")]
 pub struct SsimSettings {

@@ -1,4 +1,5 @@
-//! What the trainer trains: a Burn module that can be projected and coloured, and says which parameters it has.
+//! What the trainer trains: a Burn module that can be projected and coloured, and says which
+//! parameters it has.
 
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -8,8 +9,9 @@ use splat_ops::{OpError, Projected, ShColorSettings};
 use crate::field::Field;
 use crate::{CameraTensors, Gaussians, LearningRates, RenderSettings};
 
-/// A model of splats: any Burn module that says what to project, how to colour it, and which of its parameters are
-/// trained how. [`Gaussians`] is the first; another is often made of one and some parameters more:
+/// A model of splats: any Burn module that says what to project, how to colour it, and which of its
+/// parameters are trained how. [`Gaussians`] is the first; another is often made of one and some
+/// parameters more:
 ///
 /// ```
 /// # use splat_model::{CameraTensors, Field, Gaussians, LearningRates, RenderSettings, SplatModel};
@@ -87,8 +89,9 @@ pub trait SplatModel: Module + 'static {
         settings: &RenderSettings,
     ) -> Result<Tensor<3>, OpError>;
 
-    /// The parameters that are trained, with their learning rates: those of the run where the model has the same
-    /// fields as [`Gaussians`]. A parameter that is not among them is neither stepped nor edited.
+    /// The parameters that are trained, with their learning rates: those of the run where the model
+    /// has the same fields as [`Gaussians`]. A parameter that is not among them is neither stepped
+    /// nor edited.
     fn fields(&self, rates: &LearningRates) -> Vec<Field>;
 
     /// The scene as files hold it; what a file has no place for is left out.

@@ -1,10 +1,12 @@
-//! Neighbours in space become neighbours in memory: the order of Morton (1966), whose codes interleave the bits of the
-//! coordinates. A tile then finds its Gaussians in few pages and lines of the caches.
+//! Neighbours in space become neighbours in memory: the order of Morton (1966), whose codes
+//! interleave the bits of the coordinates. A tile then finds its Gaussians in few pages and lines
+//! of the caches.
 
 /// Bits per coordinate: a box a million times the distance of neighbours still tells them apart.
 const BITS: u32 = 21;
 
-/// The order in which to store Gaussians with these means: indices, by code. Means that are not finite come first.
+/// The order in which to store Gaussians with these means: indices, by code. Means that are not
+/// finite come first.
 pub(crate) fn order(means: &[[f32; 3]]) -> Vec<usize> {
     let finite = || {
         means
@@ -21,7 +23,8 @@ pub(crate) fn order(means: &[[f32; 3]]) -> Vec<usize> {
     let code = |mean: &[f32; 3]| {
         let bits = [0, 1, 2].map(|axis| {
             let (low, high) = (f64::from(low[axis]), f64::from(high[axis]));
-            // Casts saturate, and make zero of what is not a number: a box without a side, a mean that is not finite.
+            // Casts saturate, and make zero of what is not a number: a box without a side, a mean
+            // that is not finite.
             spread(((f64::from(mean[axis]) - low) / (high - low) * cells) as u64)
         });
         bits[0] | bits[1] << 1 | bits[2] << 2

@@ -1,4 +1,5 @@
-//! Gaussians in Burn's own file format, burnpack: tensors under the paths that they have in the module.
+//! Gaussians in Burn's own file format, burnpack: tensors under the paths that they have in the
+//! module.
 
 use std::path::{Path, PathBuf};
 
@@ -23,8 +24,8 @@ pub struct RecordError {
 }
 
 impl Gaussians {
-    /// Saves all parameters, in single precision, and the origin as a burnpack file, which replaces an old one whole or
-    /// not at all. How the scene is rendered is not part of it; a PLY file
+    /// Saves all parameters, in single precision, and the origin as a burnpack file, which replaces
+    /// an old one whole or not at all. How the scene is rendered is not part of it; a PLY file
     /// ([`splat_data::scene::ply`]) has that.
     ///
     /// ```
@@ -203,8 +204,8 @@ impl Fields {
         Some((shape, values))
     }
 
-    /// The values of a field with `width` numbers a row, and the number of its rows, which must be `n` where that is
-    /// known.
+    /// The values of a field with `width` numbers a row, and the number of its rows, which must be
+    /// `n` where that is known.
     fn rows(
         &mut self,
         name: &str,

@@ -14,9 +14,11 @@ use crate::{CameraTensors, SplatModel};
 #[derive(Debug, Clone, PartialEq, Setters)]
 #[setters(prefix = "with_", strip_option)]
 pub struct RenderSettings {
-    /// Highest degree of spherical harmonics to evaluate; at most what the model has. Default 3: all of them.
+    /// Highest degree of spherical harmonics to evaluate; at most what the model has. Default 3:
+    /// all of them.
     pub sh_degree: usize,
-    /// Gradient of the clamp of colours at zero; [`ClampGradient::Recovering`] for training. Default exact.
+    /// Gradient of the clamp of colours at zero; [`ClampGradient::Recovering`] for training.
+    /// Default exact.
     pub clamp_gradient: ClampGradient,
     /// Multiply opacities by what the low-pass filter took away (Yu et al. 2024, Mip-Splatting).
     pub antialias: bool,
@@ -49,8 +51,8 @@ impl RenderSettings {
 }
 
 impl RenderSettings {
-    /// How to render a scene as it was trained, as far as its file says, up to its degree of spherical harmonics: without
-    /// anti-aliasing and in front of black where it does not.
+    /// How to render a scene as it was trained, as far as its file says, up to its degree of
+    /// spherical harmonics: without anti-aliasing and in front of black where it does not.
     pub fn of_scene(scene: &SplatData) -> Self {
         let settings = &scene.settings;
         Self {

@@ -13,8 +13,9 @@ pub enum Moments {
     Restart,
 }
 
-/// The rows of a row set after an edit, in terms of those before. All fields of the set are edited alike, and their
-/// moments with them; what differs between fields is said by [`offset`](Self::offset) and [`set`](Self::set).
+/// The rows of a row set after an edit, in terms of those before. All fields of the set are edited
+/// alike, and their moments with them; what differs between fields is said by
+/// [`offset`](Self::offset) and [`set`](Self::set).
 ///
 /// ```
 /// use splat_model::{Moments, RowEdit};
@@ -101,7 +102,8 @@ impl RowEdit {
         self.rows.len() - 1
     }
 
-    /// Makes a new row from another old one, as when a dead Gaussian is moved to where one is needed.
+    /// Makes a new row from another old one, as when a dead Gaussian is moved to where one is
+    /// needed.
     pub fn relocate(&mut self, row: usize, source: usize, moments: Moments) {
         let row = &mut self.rows[row];
         (row.source, row.moments) = (source as u32, moments);
@@ -172,7 +174,8 @@ impl RowEdit {
         });
     }
 
-    /// Orders the new rows so that neighbours in space are neighbours in memory, given the old means.
+    /// Orders the new rows so that neighbours in space are neighbours in memory, given the old
+    /// means.
     pub fn arrange(&mut self, means: &[[f32; 3]]) {
         let means: Vec<[f32; 3]> = (0..self.len())
             .map(|row| {

@@ -1,5 +1,5 @@
-//! What the ops of a training step take with their gradients, op by op, on the CPU and on the default wgpu adapter:
-//! `cargo bench -p splat-ops --bench ops`.
+//! What the ops of a training step take with their gradients, op by op, on the CPU and on the
+//! default wgpu adapter: `cargo bench -p splat-ops --bench ops`.
 
 use burn::tensor::{DType, Device, Int, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};

@@ -7,17 +7,17 @@ use tracing::trace_span;
 use crate::backend::ActivationOps;
 use crate::settings::Activation;
 
-/// `exp(x)`, of logarithms of scales for example. The same function as [`Tensor::exp`], to 2 units in the last place on
-/// every device; on the CPU in SIMD and parallel.
+/// `exp(x)`, of logarithms of scales for example. The same function as [`Tensor::exp`], to 2 units
+/// in the last place on every device; on the CPU in SIMD and parallel.
 pub fn exp<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     activate(x, Activation::Exp)
 }
 
 /// The logistic function `1 / (1 + exp(-x))`, of opacity logits for example.
 ///
-/// Its gradient is computed from x, as `e / (1 + e)^2` with `e = exp(-|x|)`. Burn's own takes it from the output, as
-/// `o (1 - o)`, which is exactly zero once o rounds to one (from a logit of 17 on in single precision): a Gaussian could
-/// never become transparent again.
+/// Its gradient is computed from x, as `e / (1 + e)^2` with `e = exp(-|x|)`. Burn's own takes it
+/// from the output, as `o (1 - o)`, which is exactly zero once o rounds to one (from a logit of 17
+/// on in single precision): a Gaussian could never become transparent again.
 pub fn sigmoid<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     activate(x, Activation::Sigmoid)
 }

@@ -9,12 +9,12 @@ use crate::backend::{AdamOps, AdamTensors, OpInputs};
 use crate::check::Checker;
 use crate::settings::AdamStep;
 
-/// Steps a parameter and its two moments, all of one shape:
-/// `m = beta_1 m + (1 - beta_1) g`, `v = beta_2 v + (1 - beta_2) g^2`,
-/// `p = p - rate m / (sqrt(v) + epsilon)`. Not differentiable. One pass over memory, in place where nothing else
-/// holds the tensors.
+/// Steps a parameter and its two moments, all of one shape: `m = beta_1 m + (1 - beta_1) g`, `v =
+/// beta_2 v + (1 - beta_2) g^2`, `p = p - rate m / (sqrt(v) + epsilon)`. Not differentiable. One
+/// pass over memory, in place where nothing else holds the tensors.
 ///
-/// A gradient whose square is not finite counts as zero: one NaN would stay in the moments for good.
+/// A gradient whose square is not finite counts as zero: one NaN would stay in the moments for
+/// good.
 ///
 /// # Errors
 /// When shapes, types or devices differ.

@@ -1,8 +1,9 @@
-//! The traits of a backend: for each op a trait of the op as Burn dispatches it ([`ProjectOps`]), and for one with a
-//! gradient of its own a trait of that ([`ProjectBackend`]). [`SplatBackend`] is all of them.
+//! The traits of a backend: for each op a trait of the op as Burn dispatches it ([`ProjectOps`]),
+//! and for one with a gradient of its own a trait of that ([`ProjectBackend`]). [`SplatBackend`] is
+//! all of them.
 //!
-//! Callers have checked all shapes; tensors need not be contiguous. A gradient function is told which gradients are
-//! needed; the others are `None` and cost nothing.
+//! Callers have checked all shapes; tensors need not be contiguous. A gradient function is told
+//! which gradients are needed; the others are `None` and cost nothing.
 
 use core::fmt::Debug;
 
@@ -73,19 +74,19 @@ macro_rules! inputs {
 }
 
 inputs! {
-    /// OpInputs of [`ProjectOps`].
+    /// Inputs of [`ProjectOps`].
     ProjectInputs = ProjectTensors<FloatTensor<B>>;
-    /// OpInputs of [`SphericalHarmonicsOps`].
+    /// Inputs of [`SphericalHarmonicsOps`].
     SphericalHarmonicsInputs = SphericalHarmonicsTensors<FloatTensor<B>>;
-    /// OpInputs of [`ShColorsOps`].
+    /// Inputs of [`ShColorsOps`].
     ShColorInputs = ShColorTensors<FloatTensor<B>, Option<FloatTensor<B>>>;
-    /// OpInputs of [`RasterizeOps`].
+    /// Inputs of [`RasterizeOps`].
     RasterizeInputs = RasterizeTensors<FloatTensor<B>, Option<FloatTensor<B>>>;
-    /// OpInputs of [`SsimOps`].
+    /// Inputs of [`SsimOps`].
     SsimInputs = SsimTensors<FloatTensor<B>>;
-    /// OpInputs of [`AdamOps`].
+    /// Inputs of [`AdamOps`].
     AdamInputs = AdamTensors<FloatTensor<B>>;
-    /// OpInputs of [`ScreenStatisticsOps`].
+    /// Inputs of [`ScreenStatisticsOps`].
     ScreenStatisticsInputs = ScreenStatisticsTensors<FloatTensor<B>>;
 }
 
@@ -100,8 +101,8 @@ pub type RasterizeGradients<B> = RasterizeTensors<Option<FloatTensor<B>>>;
 /// Gradients of [`SsimInputs`].
 pub type SsimGradients<B> = SsimTensors<Option<FloatTensor<B>>>;
 
-/// Photo that [`photometric`](crate::photometric) compares with, `[B, H, W, D]`, in the form in which Burn's dispatch
-/// carries it.
+/// Photo that [`photometric`](crate::photometric) compares with, `[B, H, W, D]`, in the form in
+/// which Burn's dispatch carries it.
 #[derive(Debug, Clone, ExtensionType)]
 pub enum Target<B: Backend> {
     /// Levels of any integer type, 0 to 255, for `level / 255`.
@@ -225,8 +226,8 @@ pub trait ActivationBackend: ActivationOps {
 pub trait RasterizeOps: Backend {
     /// `[C, H, W, D + 1]`, the last channel being alpha.
     ///
-    /// Errors are reported to `args.errors`; the image is then zero, and the gradients that the state leads to
-    /// are.
+    /// Errors are reported to `args.errors`; the image is then zero, and the gradients that the
+    /// state leads to are.
     fn rasterize(
         #[extension_type] inputs: RasterizeInputs<Self>,
         args: RasterizeArgs,
@@ -235,7 +236,8 @@ pub trait RasterizeOps: Backend {
 
 /// The gradient of [`RasterizeOps`].
 pub trait RasterizeBackend: RasterizeOps {
-    /// Kept from the forward pass for the backward pass: lists of splats per tile, final transmittances and the like.
+    /// Kept from the forward pass for the backward pass: lists of splats per tile, final
+    /// transmittances and the like.
     type RasterizeState: Clone + Debug + Send + 'static;
 
     /// [`RasterizeOps::rasterize`], and what its gradient needs.
@@ -306,7 +308,8 @@ pub trait PhotometricBackend: PhotometricOps {
         args: &SsimArgs,
     ) -> (FloatTensor<Self>, FloatTensor<Self>);
 
-    /// Gradient of the rendered images `[B, H, W, E]`, given what was kept and the gradient `[2]` of the losses.
+    /// Gradient of the rendered images `[B, H, W, E]`, given what was kept and the gradient `[2]`
+    /// of the losses.
     fn photometric_backward(
         rendered: FloatTensor<Self>,
         target: Target<Self>,

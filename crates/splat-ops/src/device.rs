@@ -1,5 +1,6 @@
-//! Device utilities, mainly for benchmarks of CubeCL devices: what they are, what the kernels
-//! did there, how fast their memory is. Without such a device (or the features for one) there is nothing to tell.
+//! Device utilities, mainly for benchmarks of CubeCL devices: what they are, what the kernels did
+//! there, how fast their memory is. Without such a device (or the features for one) there is
+//! nothing to tell.
 
 use burn::tensor::{Device, Tensor};
 
@@ -9,14 +10,16 @@ use crate::check::is_flex;
 use crate::{Projected, RasterizeSettings, RasterizeWork};
 pub use splat_core::memory::available_memory;
 
-/// Work of the kernels since the process began, over all devices; a piece of work is a difference of two.
+/// Work of the kernels since the process began, over all devices; a piece of work is a difference
+/// of two.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct KernelWork {
     /// Kernels of ours that were launched; those of Burn are not seen here.
     pub launches: u64,
     /// Intersections of splats and tiles that were listed.
     pub intersections: u64,
-    /// Bytes reserved for results and scratch of our kernels; the same memory may be reserved many times.
+    /// Bytes reserved for results and scratch of our kernels; the same memory may be reserved many
+    /// times.
     pub reserved_bytes: u64,
     /// How often our kernels made the host wait for the device.
     pub waits: u64,
@@ -54,8 +57,8 @@ pub(crate) fn client(device: &Device) -> Option<cubecl::client::Client> {
 /// The values of a float tensor on the host, in single precision.
 ///
 /// # Errors
-/// [`OpError::Device`] when the device failed, then or in whatever the tensor was computed by: a device that works on its
-/// own says so only when something is read.
+/// [`OpError::Device`] when the device failed, then or in whatever the tensor was computed by: a
+/// device that works on its own says so only when something is read.
 pub fn to_host<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>, OpError> {
     let failed = |what: String| OpError::Device {
         op: "reading a tensor",
@@ -68,10 +71,11 @@ pub fn to_host<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>, OpError> {
     values.map_err(|error| failed(format!("{error:?}")))
 }
 
-/// To be called where a training step or the like begins. On the CPU the threads that share the work of an op, those of the
-/// pool that the caller is in or else of rayon's global one, otherwise fall asleep behind each, and to wake one takes as
-/// long as a small op: on two threads, a twentieth of a step of 15,000 Gaussians. From here on they look for work
-/// instead, until there was none for much longer than a step lies between two ops. Elsewhere this does nothing.
+/// To be called where a training step or the like begins. On the CPU the threads that share the
+/// work of an op, those of the pool that the caller is in or else of rayon's global one, otherwise
+/// fall asleep behind each, and to wake one takes as long as a small op: on two threads, a
+/// twentieth of a step of 15,000 Gaussians. From here on they look for work instead, until there
+/// was none for much longer than a step lies between two ops. Elsewhere this does nothing.
 pub fn keep_awake(device: &Device) {
     if is_flex(&device.clone().without_autodiff()) {
         #[cfg(feature = "cpu")]
@@ -79,8 +83,8 @@ pub fn keep_awake(device: &Device) {
     }
 }
 
-/// Properties of a CubeCL device, and which variant of the kernels runs there: name and value, in an order for
-/// reading. `None` for any other device.
+/// Properties of a CubeCL device, and which variant of the kernels runs there: name and value, in
+/// an order for reading. `None` for any other device.
 pub fn device_info(device: &Device) -> Option<Vec<(&'static str, String)>> {
     #[cfg(feature = "cube")]
     return client(device).map(|client| splat_kernels::device_info(&client));
@@ -91,8 +95,8 @@ pub fn device_info(device: &Device) -> Option<Vec<(&'static str, String)>> {
     }
 }
 
-/// Whether [`sh_colors`](crate::sh_colors) reads coefficients in half precision (F16) on a device as they are. Where it
-/// does not, it makes others of them, which costs more than it saves.
+/// Whether [`sh_colors`](crate::sh_colors) reads coefficients in half precision (F16) on a device
+/// as they are. Where it does not, it makes others of them, which costs more than it saves.
 pub fn reads_half(device: &Device) -> bool {
     #[cfg(feature = "cube")]
     return client(device).is_some_and(|client| splat_kernels::reads_half(&client));
@@ -132,9 +136,9 @@ impl KernelWork {
     }
 }
 
-/// Bytes of device memory that the kernels of a training step with three colours cannot do without: by stage, in order,
-/// read and written together. `splat_kernels::floor` says what is counted and what is estimated. `None` where the
-/// device is none of CubeCL.
+/// Bytes of device memory that the kernels of a training step with three colours cannot do without:
+/// by stage, in order, read and written together. `splat_kernels::floor` says what is counted and
+/// what is estimated. `None` where the device is none of CubeCL.
 pub fn step_floor(device: &Device, sizes: &StepSizes) -> Option<Vec<(&'static str, u64)>> {
     #[cfg(feature = "cube")]
     {
@@ -159,8 +163,8 @@ pub fn step_floor(device: &Device, sizes: &StepSizes) -> Option<Vec<(&'static st
     }
 }
 
-/// Bytes per second, read and written together, of a plain kernel that copies `bytes`: what a stage bound by memory
-/// could reach. `None` where the device is none of CubeCL.
+/// Bytes per second, read and written together, of a plain kernel that copies `bytes`: what a stage
+/// bound by memory could reach. `None` where the device is none of CubeCL.
 ///
 /// # Errors
 /// The device's error.
@@ -182,11 +186,13 @@ pub fn copy_bandwidth(device: &Device, bytes: usize) -> Result<Option<f64>, OpEr
     }
 }
 
-/// Counts the work of [`rasterize`](crate::rasterize) with the same arguments, by doing it on their device.
+/// Counts the work of [`rasterize`](crate::rasterize) with the same arguments, by doing it on their
+/// device.
 ///
-/// A CubeCL device tests other pairs than the CPU: there a block of the tile's pixels (8 x 8, or 4 x 4 where planes are
-/// not known) walks all splats of the tile whose ellipse meets the block, each at all pixels of the block that are still
-/// open. On the CPU rows are cut to the ellipse in steps of eight pixels.
+/// A CubeCL device tests other pairs than the CPU: there a block of the tile's pixels (8 x 8, or 4
+/// x 4 where planes are not known) walks all splats of the tile whose ellipse meets the block, each
+/// at all pixels of the block that are still open. On the CPU rows are cut to the ellipse in steps
+/// of eight pixels.
 ///
 /// # Errors
 /// As [`rasterize`](crate::rasterize).

@@ -11,13 +11,14 @@
 //! CubeCL device (feature `wgpu`, `vulkan`, `cuda`) and native Rust for Burn's Flex backend
 //! (feature `cpu`; f32, and f64 as the reference).
 //!
-//! Every op and every gradient runs in a `tracing` span of its name, level trace, on the caller's thread: one load and a
-//! branch where nobody listens.
+//! Every op and every gradient runs in a `tracing` span of its name, level trace, on the caller's
+//! thread: one load and a branch where nobody listens.
 //!
 //! # Conventions
 //! - World and camera are right-handed; camera axes are +x right, +y down, +z forward (OpenCV,
 //!   COLMAP). `viewmat` is world-to-camera, row-major 4x4.
-//! - The centre of pixel (i, j) is at (i + 0.5, j + 0.5); intrinsics (fx, fy, cx, cy) are in pixels.
+//! - The centre of pixel (i, j) is at (i + 0.5, j + 0.5); intrinsics (fx, fy, cx, cy) are in
+//!   pixels.
 //! - Quaternions are (w, x, y, z) of any non-zero length; scales are linear and positive; opacities
 //!   lie in (0, 1).
 //! - C is the number of cameras, N of Gaussians, D of colour channels.

@@ -1,4 +1,5 @@
-//! The photometric loss of splatting: L1 and structural similarity of what was rendered and a photo.
+//! The photometric loss of splatting: L1 and structural similarity of what was rendered and a
+//! photo.
 
 use burn::backend::Dispatch;
 use burn::tensor::{Int, Tensor};
@@ -12,7 +13,8 @@ use crate::settings::SsimArgs;
 /// Images that [`photometric`] compares with, `[B, H, W, D]`.
 #[derive(Debug, Clone)]
 pub enum Target {
-    /// 8-bit levels, 0 to 255, that stand for `level / 255`. Of type U8 they are read as they are, on GPUs of type I32 too.
+    /// 8-bit levels, 0 to 255, that stand for `level / 255`. Of type U8 they are read as they are,
+    /// on GPUs of type I32 too.
     Levels(Tensor<4, Int>),
     /// The values themselves.
     Values(Tensor<4>),
@@ -37,8 +39,9 @@ pub struct Photometric {
 }
 
 impl Photometric {
-    /// `[2]`: the mean absolute difference and one less the mean structural similarity, the terms of 3DGS eq. 7, both zero
-    /// for equal images. Nothing is cut: a loss that weighs and adds them as they are has the least to do.
+    /// `[2]`: the mean absolute difference and one less the mean structural similarity, the terms
+    /// of 3DGS eq. 7, both zero for equal images. Nothing is cut: a loss that weighs and adds them
+    /// as they are has the least to do.
     pub fn losses(&self) -> Tensor<1> {
         self.losses.clone()
     }
@@ -54,17 +57,19 @@ impl Photometric {
     }
 }
 
-/// Mean absolute difference and mean structural similarity (Wang et al. 2004, eq. 13) of images `[B, H, W, E]` and a
-/// target `[B, H, W, D]`, over the first D of the E channels: what [`rasterize`](crate::rasterize) returns packed needs
-/// no cutting. The similarity, that of [`ssim_map`](crate::ssim_map), is the mean over channels and over the pixels whose
-/// window lies inside of the image, as scikit-image, torchmetrics and gsplat have it; in an image smaller than the
-/// window every pixel counts.
+/// Mean absolute difference and mean structural similarity (Wang et al. 2004, eq. 13) of images
+/// `[B, H, W, E]` and a target `[B, H, W, D]`, over the first D of the E channels: what
+/// [`rasterize`](crate::rasterize) returns packed needs no cutting. The similarity, that of
+/// [`ssim_map`](crate::ssim_map), is the mean over channels and over the pixels whose window lies
+/// inside of the image, as scikit-image, torchmetrics and gsplat have it; in an image smaller than
+/// the window every pixel counts.
 ///
-/// Differentiable in the images; other channels than the first D have a gradient of zero. The target is a constant.
+/// Differentiable in the images; other channels than the first D have a gradient of zero. The
+/// target is a constant.
 ///
 /// # Errors
-/// When shapes, types or devices do not fit, the target is tracked by autodiff, or the window's length is even or it is
-/// not symmetric.
+/// When shapes, types or devices do not fit, the target is tracked by autodiff, or the window's
+/// length is even or it is not symmetric.
 pub fn photometric(
     rendered: Tensor<4>,
     target: impl Into<Target>,
@@ -104,11 +109,12 @@ pub fn photometric(
     })
 }
 
-/// [`photometric`] of the pixels that a mask `[B, H, W, 1]` keeps (1; 0 leaves out), as gsplat has it: the mean absolute
-/// difference is that of the pixels kept, the structural similarity that of both images times the mask. A mask that keeps
-/// nothing gives a difference of zero.
+/// [`photometric`] of the pixels that a mask `[B, H, W, 1]` keeps (1; 0 leaves out), as gsplat has
+/// it: the mean absolute difference is that of the pixels kept, the structural similarity that of
+/// both images times the mask. A mask that keeps nothing gives a difference of zero.
 ///
-/// Without a mask call [`photometric`], which reads bytes as they are; here the target becomes floats.
+/// Without a mask call [`photometric`], which reads bytes as they are; here the target becomes
+/// floats.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};

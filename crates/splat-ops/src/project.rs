@@ -76,9 +76,10 @@ impl Projected {
         self.size
     }
 
-    /// The same splats, and a leaf `[C, N, 9]` tied to them, whose gradient after the backward pass is theirs: its first
-    /// two columns are that of the screen means, which density control reads (3DGS section 5.2). The leaf lies in the
-    /// memory of the splats, and its gradient in that of theirs: nothing is copied.
+    /// The same splats, and a leaf `[C, N, 9]` tied to them, whose gradient after the backward pass
+    /// is theirs: its first two columns are that of the screen means, which density control reads
+    /// (3DGS section 5.2). The leaf lies in the memory of the splats, and its gradient in that of
+    /// theirs: nothing is copied.
     pub fn with_screen_probe(self) -> (Self, Tensor<3>) {
         let probe = self.packed.clone().detach().require_grad();
         let packed =

@@ -15,7 +15,8 @@ use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
 #[derive(Debug, Clone)]
 pub struct Rendered {
     packed: Tensor<4>,
-    /// Cut out of it when first asked for, and once: every cut is a copy, and its gradient a whole picture.
+    /// Cut out of it when first asked for, and once: every cut is a copy, and its gradient a whole
+    /// picture.
     image: OnceLock<Tensor<4>>,
     alpha: OnceLock<Tensor<4>>,
 }
@@ -33,7 +34,8 @@ impl Rendered {
         self.image.get_or_init(cut).clone()
     }
 
-    /// The same alpha with another image of the same size, such as one whose exposure was corrected. A copy.
+    /// The same alpha with another image of the same size, such as one whose exposure was
+    /// corrected. A copy.
     ///
     /// # Errors
     /// When the image has another number of cameras, or another height or width.
@@ -65,14 +67,15 @@ impl Rendered {
 /// - `opacities` `[C, N]` or `[N]`: in (0, 1).
 /// - `background` `[C, D]`: blended behind the splats with the final transmittance.
 ///
-/// Splats are ordered by depth, ties by index. Per pixel `alpha = min(alpha_max, o exp(-sigma))`;
-/// a splat with less than `alpha_min` is skipped, and the pixel stops before its transmittance
-/// would fall below `transmittance_min`. Every splat that was blended gets gradients, to screen
-/// mean, inverse Cholesky factor, colour and opacity; depth and extent only order and cull.
+/// Splats are ordered by depth, ties by index. Per pixel `alpha = min(alpha_max, o exp(-sigma))`; a
+/// splat with less than `alpha_min` is skipped, and the pixel stops before its transmittance would
+/// fall below `transmittance_min`. Every splat that was blended gets gradients, to screen mean,
+/// inverse Cholesky factor, colour and opacity; depth and extent only order and cull.
 ///
 /// # Errors
-/// When shapes, types or devices do not fit, when a setting is out of range, when the splats touch more tiles than one call
-/// can list ([`OpError::TooManyIntersections`]), and when the device fails.
+/// When shapes, types or devices do not fit, when a setting is out of range, when the splats touch
+/// more tiles than one call can list ([`OpError::TooManyIntersections`]), and when the device
+/// fails.
 pub fn rasterize<const DC: usize, const DO: usize>(
     projected: &Projected,
     colors: Tensor<DC>,
@@ -120,7 +123,8 @@ pub fn rasterize<const DC: usize, const DO: usize>(
     })
 }
 
-/// Behind an alpha of one there would be no light to divide by, and a splat without a least alpha has no end.
+/// Behind an alpha of one there would be no light to divide by, and a splat without a least alpha
+/// has no end.
 pub(crate) fn check_settings(settings: &RasterizeSettings) -> Result<(), OpError> {
     let RasterizeSettings {
         alpha_min,
@@ -142,8 +146,8 @@ pub(crate) fn check_settings(settings: &RasterizeSettings) -> Result<(), OpError
     })
 }
 
-/// One tensor for all `cameras`, repeated for each. For one camera there is nothing to repeat, and nothing to sum in
-/// the gradient.
+/// One tensor for all `cameras`, repeated for each. For one camera there is nothing to repeat, and
+/// nothing to sum in the gradient.
 fn repeat<const R: usize>(one: Tensor<R>, cameras: usize) -> Tensor<R> {
     match cameras {
         1 => one,

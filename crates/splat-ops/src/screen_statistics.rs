@@ -10,17 +10,19 @@ use crate::{OpError, Projected};
 /// Sums over the views so far, per Gaussian.
 #[derive(Debug, Clone)]
 pub struct ScreenStatistics {
-    /// `[N]`: lengths of the gradients of the screen means, in half images, as gsplat measures them.
+    /// `[N]`: lengths of the gradients of the screen means, in half images, as gsplat measures
+    /// them.
     pub gradients: Tensor<1>,
     /// `[N]`: views that saw the Gaussian.
     pub views: Tensor<1>,
 }
 
 impl ScreenStatistics {
-    /// Adds a step: splats, and the gradient of their packed rows `[C, N, 9]`, of a loss that is a mean over C cameras, as
-    /// [`Projected::with_screen_probe`] hears it. Its first two columns count, in 1 / pixels, where the extent says that a
-    /// camera sees the Gaussian. A gradient that is not finite counts as zero. One pass over memory, in place where
-    /// nothing else holds the statistics. Not differentiable.
+    /// Adds a step: splats, and the gradient of their packed rows `[C, N, 9]`, of a loss that is a
+    /// mean over C cameras, as [`Projected::with_screen_probe`] hears it. Its first two columns
+    /// count, in 1 / pixels, where the extent says that a camera sees the Gaussian. A gradient that
+    /// is not finite counts as zero. One pass over memory, in place where nothing else holds the
+    /// statistics. Not differentiable.
     ///
     /// # Errors
     /// When shapes, types or devices do not fit.

@@ -16,18 +16,20 @@ use crate::{OpError, Projected, SH_DEGREE_MAX, ShColorSettings, sh_coefficient_c
 ///
 /// # Arguments
 /// - `sh0` `[N, 1, 3]`: coefficients of degree 0.
-/// - `sh_rest` `[N, R, 3]` with 1 + R >= (degree + 1)^2: those of the higher degrees. What is beyond `degree` is not read
-///   and gets zero gradient; at degree 0 none of it is read, and it is no part of the graph. May be of half precision
-///   (F16) if autodiff does not track it: half of the bytes to store and to read, each coefficient to 2^-11 of itself,
-///   all sums as ever.
+/// - `sh_rest` `[N, R, 3]` with 1 + R >= (degree + 1)^2: those of the higher degrees. What is
+///   beyond `degree` is not read and gets zero gradient; at degree 0 none of it is read, and it is
+///   no part of the graph. May be of half precision (F16) if autodiff does not track it: half of
+///   the bytes to store and to read, each coefficient to 2^-11 of itself, all sums as ever.
 /// - `means` `[N, 3]`: world space.
 /// - `centers` `[C, 3]`: where the cameras stand.
 /// - `settings`: the degree, 0 to 3, and the gradient of the clamp; a degree alone will do.
-/// - `seen`: the same Gaussians projected by the same cameras. Those that are culled there (no extent) are black and pass no
-///   gradient on; their coefficients are not read. Without it all colours are computed.
+/// - `seen`: the same Gaussians projected by the same cameras. Those that are culled there (no
+///   extent) are black and pass no gradient on; their coefficients are not read. Without it all
+///   colours are computed.
 ///
 /// A channel that is clamped at zero passes no gradient on, unless
-/// [`ClampGradient::Recovering`](crate::ClampGradient::Recovering) is asked for; one that is exactly zero does.
+/// [`ClampGradient::Recovering`](crate::ClampGradient::Recovering) is asked for; one that is
+/// exactly zero does.
 ///
 /// # Errors
 /// When the degree is above 3, or shapes, types or devices do not fit.
@@ -86,8 +88,8 @@ pub fn sh_colors(
     Ok(Tensor::from_dispatch(Dispatch::sh_colors(inputs, settings)))
 }
 
-/// Coefficients as the device of the op reads them: those in half precision as they are where its kernels can, and
-/// otherwise in the type of all other tensors.
+/// Coefficients as the device of the op reads them: those in half precision as they are where its
+/// kernels can, and otherwise in the type of all other tensors.
 fn readable(check: &Checker, rest: Tensor<3>, dtype: DType) -> Result<Tensor<3>, OpError> {
     if rest.dtype() != DType::F16 {
         check.tensor("sh_rest", &rest, [None; 3], "[N, R, 3]")?;

@@ -11,8 +11,8 @@ use crate::backend::{OpInputs, SsimOps, SsimTensors};
 use crate::check::Checker;
 use crate::settings::SsimArgs;
 
-/// Structural similarity of two images `[B, H, W, D]` at every pixel and channel, `[B, H, W, D]`, zeros outside of
-/// the images:
+/// Structural similarity of two images `[B, H, W, D]` at every pixel and channel, `[B, H, W, D]`,
+/// zeros outside of the images:
 ///
 /// ```text
 /// S = (2 mx my + c1) (2 (E[xy] - mx my) + c2) / ((mx^2 + my^2 + c1) (E[x^2 + y^2] - mx^2 - my^2 + c2))
@@ -34,8 +34,8 @@ pub fn ssim_map(x: Tensor<4>, y: Tensor<4>, args: &SsimArgs) -> Result<Tensor<4>
     Ok(Tensor::from_dispatch(Dispatch::ssim(inputs, args.clone())))
 }
 
-/// The rows and columns of the pixels of an image of `[height, width]` whose window lies inside; all of them where there
-/// is none.
+/// The rows and columns of the pixels of an image of `[height, width]` whose window lies inside;
+/// all of them where there is none.
 pub(crate) fn counted([height, width]: [usize; 2], window: usize) -> [Range<usize>; 2] {
     let radius = if height < window || width < window {
         0

@@ -2,8 +2,9 @@
 
 use std::fmt::Display;
 
-/// The adapter that a test of the CubeCL kernels opened, a software one included. Where there is none the test is skipped,
-/// loudly; with the environment variable `SPLAT_REQUIRE_WGPU` set, as in CI, that is a failure.
+/// The adapter that a test of the CubeCL kernels opened, a software one included. Where there is
+/// none the test is skipped, loudly; with the environment variable `SPLAT_REQUIRE_WGPU` set, as in
+/// CI, that is a failure.
 ///
 /// # Panics
 /// Without an adapter where one is required.

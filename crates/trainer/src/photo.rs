@@ -8,7 +8,8 @@ pub fn photo(view: &View, device: &Device) -> Tensor<4> {
     values(pixels_u8(view, device))
 }
 
-/// The photo of a view as it is stored, 8 bits a value, `[1, H, W, 3]`: of type U8 where the device can compute with it.
+/// The photo of a view as it is stored, 8 bits a value, `[1, H, W, 3]`: of type U8 where the device
+/// can compute with it.
 pub(crate) fn pixels_u8(view: &View, device: &Device) -> Tensor<4, Int> {
     let dtype = match device.supports_dtype(DType::U8) {
         true => DType::U8,

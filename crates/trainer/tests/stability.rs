@@ -1,4 +1,5 @@
-//! Deliberately bad starts: a run of 500 steps ends, every parameter stays finite, and a warning names what is wrong.
+//! Deliberately bad starts: a run of 500 steps ends, every parameter stays finite, and a warning
+//! names what is wrong.
 #![cfg(feature = "cpu")]
 
 use std::path::Path;
@@ -89,7 +90,8 @@ fn assert_all_finite(trained: &Trained) {
     assert_eq!(losses.len(), trained.steps, "some losses were not finite");
 }
 
-/// Name of the spoiled view, and what becomes of its camera: the new world-to-camera matrix from the old.
+/// Name of the spoiled view, and what becomes of its camera: the new world-to-camera matrix from
+/// the old.
 fn spoil_camera(
     capture: &mut Capture,
     change: impl Fn([[f64; 4]; 4]) -> [[f64; 4]; 4],
@@ -244,7 +246,8 @@ fn high_learning_rates_are_named_with_their_factor() {
     }
 }
 
-/// Black points start at the clamp of colours at zero, behind which nothing learns. Colours take at most 7e-4 a step.
+/// Black points start at the clamp of colours at zero, behind which nothing learns. Colours take at
+/// most 7e-4 a step.
 #[test]
 fn black_points_learn_their_colours() {
     let mean_loss = |blacken: fn(usize) -> bool| {
@@ -265,7 +268,8 @@ fn black_points_learn_their_colours() {
             .run()
             .unwrap();
         let sh0 = trained.model.to_data().sh0;
-        // A channel that never got a gradient is where black begins: at level 0, or at half a level.
+        // A channel that never got a gradient is where black begins: at level 0, or at half a
+        // level.
         let start = |level: f64| ((level / 255.0 - 0.5) / 0.282_094_791_773_878_14) as f32;
         let starts = [start(0.0), start(0.5)];
         let channels = sh0.iter().flatten();

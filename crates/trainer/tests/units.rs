@@ -53,7 +53,8 @@ fn relative(a: &[f32], b: &[f32], factor: f64) -> f64 {
     (error / size).sqrt()
 }
 
-/// The first render and its gradients, lengths in the capture's unit: name, values, and the power of the unit in them.
+/// The first render and its gradients, lengths in the capture's unit: name, values, and the power
+/// of the unit in them.
 fn first_step(unit: f64) -> Vec<(&'static str, Vec<f32>, i32)> {
     fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
         tensor.into_data().try_into_vec().unwrap()

@@ -1,6 +1,6 @@
-//! Everything that one may bring along, in a crate that depends on `burn-splat` alone: a strategy, a loss, a model with a
-//! parameter that `Gaussians` does not have, and a module that is trained beside it.
-//! `cargo run --release -- [CAPTURE [STEPS]]`
+//! Everything that one may bring along, in a crate that depends on `burn-splat` alone: a strategy,
+//! a loss, a model with a parameter that `Gaussians` does not have, and a module that is trained
+//! beside it. `cargo run --release -- [CAPTURE [STEPS]]`
 
 mod exposure;
 mod model;

@@ -1,4 +1,5 @@
-//! A strategy: every 25 steps the faintest Gaussians go, and those with the largest gradients are cloned.
+//! A strategy: every 25 steps the faintest Gaussians go, and those with the largest gradients are
+//! cloned.
 
 use burn_splat::model::strategy::{Refinement, ScreenWants, StepContext, StepInfo, Strategy};
 use burn_splat::model::{Moments, RowEdit, SplatModel};

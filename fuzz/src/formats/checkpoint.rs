@@ -1,5 +1,5 @@
-//! Checkpoints: safetensors with a model, its moments and what the strategy keeps, and what is known of the run as JSON in
-//! the metadata.
+//! Checkpoints: safetensors with a model, its moments and what the strategy keeps, and what is
+//! known of the run as JSON in the metadata.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex};

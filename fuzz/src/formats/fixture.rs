@@ -54,7 +54,8 @@ fn seeds() -> Vec<Input> {
     vec![one, two, none]
 }
 
-/// N Gaussians in front of one camera, or of C, and a picture of 5 x 4 pixels. The gradients are any numbers.
+/// N Gaussians in front of one camera, or of C, and a picture of 5 x 4 pixels. The gradients are
+/// any numbers.
 fn fixture(
     n: usize,
     c: Option<usize>,

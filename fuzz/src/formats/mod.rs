@@ -51,8 +51,8 @@ pub struct Memory {
     pub constant: usize,
 }
 
-/// Every reader. The bounds of memory are stated here and nowhere else. That of TOML is the library's: every `{a=` begins a
-/// table.
+/// Every reader. The bounds of memory are stated here and nowhere else. That of TOML is the
+/// library's: every `{a=` begins a table.
 ///
 /// | reader | bytes for each of the file | and |
 /// |---|---|---|

@@ -19,7 +19,8 @@ pub(super) const TARGET: Target = Target {
     mutate,
     parse,
     follow_every: 64,
-    // The PLY library makes room for up to 65,536 entries of a list, 8 bytes each, before it finds that the file ends.
+    // The PLY library makes room for up to 65,536 entries of a list, 8 bytes each, before it finds
+    // that the file ends.
     memory: Memory {
         per_byte: 32,
         constant: 8 * 65_536 + (8 << 10),

@@ -1,4 +1,5 @@
-//! Safetensors files, of which fixtures and checkpoints are some: a length, a header in JSON, and data.
+//! Safetensors files, of which fixtures and checkpoints are some: a length, a header in JSON, and
+//! data.
 
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;

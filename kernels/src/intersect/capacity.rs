@@ -9,17 +9,19 @@ use cubecl::prelude::*;
 use super::{Frames, IntersectError};
 use crate::rasterize::MAX_SLOT_VALUES;
 
-/// Intersections that can be listed: kernels address memory by 32-bit indices, and the backward pass keeps up to
-/// [`MAX_SLOT_VALUES`] floats per intersection.
+/// Intersections that can be listed: kernels address memory by 32-bit indices, and the backward
+/// pass keeps up to [`MAX_SLOT_VALUES`] floats per intersection.
 pub const MAX_INTERSECTIONS: u64 = u32::MAX as u64 / MAX_SLOT_VALUES as u64;
 
-/// Intersections that a device can list: each is one number in each of several buffers, whose size the device limits.
+/// Intersections that a device can list: each is one number in each of several buffers, whose size
+/// the device limits.
 pub(super) fn max_intersections(client: &Client) -> u64 {
     let largest_buffer = client.properties().memory.max_page_size;
     MAX_INTERSECTIONS.min(largest_buffer / size_of::<u32>() as u64)
 }
 
-/// The one place that decides how many intersections are too many. Asked before any list is allocated.
+/// The one place that decides how many intersections are too many. Asked before any list is
+/// allocated.
 pub(super) fn check_intersections(count: u64, limit: u64) -> Result<usize, IntersectError> {
     match usize::try_from(count) {
         Ok(intersections) if count <= limit => Ok(intersections),
@@ -27,8 +29,8 @@ pub(super) fn check_intersections(count: u64, limit: u64) -> Result<usize, Inter
     }
 }
 
-/// Room for the next lists of one device and image size. Lists of any capacity that suffices are the same, so that what
-/// happened before never changes a result.
+/// Room for the next lists of one device and image size. Lists of any capacity that suffices are
+/// the same, so that what happened before never changes a result.
 pub(super) struct Room {
     key: u64,
 }

@@ -37,7 +37,8 @@ impl Footprint {
     ) -> Footprint {
         let ratio = opacity / alpha_min;
         let cut = f32::ln(ratio) * 1.0001f32 + 1e-4f32;
-        // Standard deviations along x and y: L = W⁻¹ has l11 = 1/w11, l21 = -w21/(w11 w22), l22 = 1/w22.
+        // Standard deviations along x and y: L = W⁻¹ has l11 = 1/w11, l21 = -w21/(w11 w22), l22 =
+        // 1/w22.
         let reach = f32::sqrt(2.0f32 * cut);
         let half_x = reach / w11;
         let slope = w21 / w11;
@@ -71,7 +72,8 @@ impl Footprint {
         // Lowest point of the facing vertical edge: dσ/ddy = 0 at dy = -w21 dx / w22.
         let edge_x = select(dx0 > 0.0f32, dx0, dx1);
         let on_x = min(max(-self.w21 * edge_x / self.w22, dy0), dy1);
-        // Lowest point of the facing horizontal edge: dσ/ddx = 0 at dx = -w21 w22 dy / (w11² + w21²).
+        // Lowest point of the facing horizontal edge: dσ/ddx = 0 at dx = -w21 w22 dy / (w11² +
+        // w21²).
         let edge_y = select(dy0 > 0.0f32, dy0, dy1);
         let on_y = min(
             max(
@@ -85,7 +87,8 @@ impl Footprint {
         (!beside && !above) || hit_x || hit_y
     }
 
-    /// A lower bound of sigma at (dx, dy) from the mean, below its rounding error for long and thin splats.
+    /// A lower bound of sigma at (dx, dy) from the mean, below its rounding error for long and thin
+    /// splats.
     fn sigma_below(self, dx: f32, dy: f32) -> f32 {
         let z1 = self.w11 * dx;
         let along = self.w21 * dx;
@@ -118,8 +121,8 @@ pub(super) fn footprint(
     f
 }
 
-/// First tile and end of those that the interval mean +- half reaches, of `count` in a row or column; half a pixel
-/// and one part in 10,000 of slack.
+/// First tile and end of those that the interval mean +- half reaches, of `count` in a row or
+/// column; half a pixel and one part in 10,000 of slack.
 #[cube]
 fn tile_range(mean: f32, half: f32, count: u32) -> (u32, u32) {
     let reach = half * 1.0001f32 + 0.5f32;

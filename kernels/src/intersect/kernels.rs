@@ -63,8 +63,8 @@ fn emit_intersection(
     }
 }
 
-/// Counting and emitting are two compilations of one function. Should a compiler round them differently, the slots left
-/// over go to no tile.
+/// Counting and emitting are two compilations of one function. Should a compiler round them
+/// differently, the slots left over go to no tile.
 #[cube]
 fn emit_nothing(
     keys: &mut [u32],
@@ -174,8 +174,9 @@ fn walk_wide(
     }
 }
 
-/// Tiles touched by the j-th splat of `order`. Counting: `offsets[j]` = their number, 0 behind the last splat. Emitting:
-/// their keys (tile index over all cameras), slots and splats, from slot `offsets[j]` on; none from slot `capacity` on.
+/// Tiles touched by the j-th splat of `order`. Counting: `offsets[j]` = their number, 0 behind the
+/// last splat. Emitting: their keys (tile index over all cameras), slots and splats, from slot
+/// `offsets[j]` on; none from slot `capacity` on.
 #[cube(launch)]
 pub(super) fn walk_tiles(
     packed: &[f32],

@@ -8,7 +8,8 @@ use crate::launch::{Buffer, per_element};
 use crate::scan::{PendingTotal, exclusive_sum, exclusive_sum_with_total};
 use crate::sort::{bits_for, sort_first_pairs};
 
-/// The visible splats in order, and where their slots begin: all that is known before there is memory for intersections.
+/// The visible splats in order, and where their slots begin: all that is known before there is
+/// memory for intersections.
 pub(super) struct Counted<'a> {
     packed: &'a Buffer,
     opacities: &'a Buffer,

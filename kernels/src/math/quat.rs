@@ -105,7 +105,8 @@ impl Quat {
         }
     }
 
-    /// Vector-Jacobian product of [`Quat::to_matrix`]: gradient of the unit quaternion from that of the matrix.
+    /// Vector-Jacobian product of [`Quat::to_matrix`]: gradient of the unit quaternion from that of
+    /// the matrix.
     pub fn to_matrix_vjp(self, grad: Mat3) -> Quat {
         let Quat { w, x, y, z } = self;
         // Antisymmetric and symmetric parts of the gradient.

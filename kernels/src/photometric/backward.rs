@@ -8,8 +8,8 @@ use super::tile::{
 use super::{Sizes, TargetKind};
 use crate::ssim::{RUN, UNROLLED_TAPS, load_window, windowed};
 
-/// The derivatives, windowed, put together with the sign of x - y: the gradient of x; zero for the channels beyond the
-/// photo's.
+/// The derivatives, windowed, put together with the sign of x - y: the gradient of x; zero for the
+/// channels beyond the photo's.
 #[cube(launch)]
 pub(super) fn photometric_gradient(
     rendered: &[f32],

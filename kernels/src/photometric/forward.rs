@@ -68,7 +68,8 @@ fn moments_of_rows(
     }
 }
 
-/// Sums of |x - y| and of S over the unit's run of a tile; if `keep`, the derivatives go to `fields`.
+/// Sums of |x - y| and of S over the unit's run of a tile; if `keep`, the derivatives go to
+/// `fields`.
 #[cube]
 fn measure_run(
     rendered: &[f32],
@@ -128,7 +129,8 @@ fn measure_run(
     (difference, similarity)
 }
 
-/// Sums of |x - y| and of S over a tile, to `partials[workgroup, 2]`; if `keep`, the derivatives too.
+/// Sums of |x - y| and of S over a tile, to `partials[workgroup, 2]`; if `keep`, the derivatives
+/// too.
 #[cube(launch)]
 pub(super) fn photometric_tiles(
     rendered: &[f32],

@@ -8,8 +8,8 @@ use crate::ssim::{RUN, UNROLLED_TAPS, windowed};
 /// Pixels of a tile.
 pub(super) const TILE_WIDTH: usize = 32;
 pub(super) const TILE_HEIGHT: usize = 16;
-/// Floats from a row in shared memory to the next: one more than there are, so that the runs of several rows are in
-/// different banks.
+/// Floats from a row in shared memory to the next: one more than there are, so that the runs of
+/// several rows are in different banks.
 pub(super) const PITCH: usize = TILE_WIDTH + 1;
 /// Runs along a row of a tile.
 pub(super) const RUNS: usize = TILE_WIDTH / RUN;
@@ -50,8 +50,8 @@ impl Place {
         }
     }
 
-    /// Whether a pixel is in the image, and its index over all images; that of some other pixel if not. Its place may be
-    /// shifted by `back` to the left and up, beyond the edge.
+    /// Whether a pixel is in the image, and its index over all images; that of some other pixel if
+    /// not. Its place may be shifted by `back` to the left and up, beyond the edge.
     pub fn pixel(self, sizes: Sizes, x: u32, y: u32, back: u32) -> (bool, usize) {
         let inside = self.exists
             && x >= back

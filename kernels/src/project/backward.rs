@@ -157,7 +157,8 @@ fn project_backward_cameras(
     }
 }
 
-/// Adds the blocks' partial gradients of every camera, in order. The last row of a view matrix has no influence.
+/// Adds the blocks' partial gradients of every camera, in order. The last row of a view matrix has
+/// no influence.
 #[cube(launch)]
 fn sum_camera_partials(
     partials: &[f32],
@@ -189,8 +190,8 @@ fn sum_camera_partials(
     }
 }
 
-/// Gradients of means [N, 3], quats [N, 4], scales [N, 3], viewmats [C, 4, 4] and intrinsics [C, 4] for the gradient
-/// of the packed splats [C, N, 9]; only those that `needs_grad` names.
+/// Gradients of means [N, 3], quats [N, 4], scales [N, 3], viewmats [C, 4, 4] and intrinsics [C, 4]
+/// for the gradient of the packed splats [C, N, 9]; only those that `needs_grad` names.
 pub fn project_backward(
     client: &Client,
     inputs: &ProjectInputs,

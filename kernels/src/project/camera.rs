@@ -1,4 +1,5 @@
-//! One camera: how it sees a point, and the vector-Jacobian product of that. Another camera model replaces this file.
+//! One camera: how it sees a point, and the vector-Jacobian product of that. Another camera model
+//! replaces this file.
 //!
 //! ```text
 //! p = W mean + t = (x, y, z)                      mean2d = (fx x/z + cx, fy y/z + cy)

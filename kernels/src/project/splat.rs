@@ -29,7 +29,8 @@ impl Gaussian {
     }
 }
 
-/// The 2D covariance with the low-pass filter, by way of V = J W R diag(s), in units of the splat's own size.
+/// The 2D covariance with the low-pass filter, by way of V = J W R diag(s), in units of the splat's
+/// own size.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(super) struct Covariance {

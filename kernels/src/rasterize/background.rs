@@ -1,5 +1,5 @@
-//! The gradient of the background: per camera and channel the sum over pixels of T_end g, by blocks of pixels and then
-//! over the blocks, in order.
+//! The gradient of the background: per camera and channel the sum over pixels of T_end g, by blocks
+//! of pixels and then over the blocks, in order.
 //!
 //! Floor per pixel: 4 bytes and 4 per channel from memory, 2 operations per channel.
 

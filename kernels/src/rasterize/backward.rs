@@ -1,16 +1,17 @@
 //! The gradient of every intersection, back to front; `sums.rs` has what becomes of it.
 //!
-//! With g = dL/dsigma of one pixel, all gradients of a splat's shape follow from six sums over pixels:
+//! With g = dL/dsigma of one pixel, all gradients of a splat's shape follow from six sums over
+//! pixels:
 //! ```text
 //! A = Σ g,  B = Σ g z1,  C = Σ g z2,  D = Σ g z1 dx,  E = Σ g z2 dx,  F = Σ g z2 dy
 //! dL/dw11 = D,  dL/dw21 = E,  dL/dw22 = F,  dL/dmean = -(w11 B + w21 C, w22 C),  dL/do = -A / o
 //! ```
-//! Each block sums its pixels, and the tile its blocks (in order). One value of an intersection goes to its slot, or
-//! is added to the splat's gradient at once.
+//! Each block sums its pixels, and the tile its blocks (in order). One value of an intersection
+//! goes to its slot, or is added to the splat's gradient at once.
 //!
-//! Floor per (block, splat) pair: as forward, plus 24 bytes and 4 per channel to shared memory; per pixel of the block
-//! about 45 operations and 4 per channel. Per intersection: 32 bytes and 4 per channel from memory (28 without
-//! slots), and what `sums.rs` counts.
+//! Floor per (block, splat) pair: as forward, plus 24 bytes and 4 per channel to shared memory; per
+//! pixel of the block about 45 operations and 4 per channel. Per intersection: 32 bytes and 4 per
+//! channel from memory (28 without slots), and what `sums.rs` counts.
 
 use cubecl::prelude::*;
 
@@ -19,7 +20,8 @@ use super::sums::{Sums, Target, TargetExpand, add_to_splat};
 use super::tile::{BATCH, Batch, Place, Plan, WORDS, pixel_index, place};
 use crate::intersect::Grid;
 
-/// Gradients of a splat's shape and opacity in a slot, in the order of [`SHAPE`]; those of colours follow.
+/// Gradients of a splat's shape and opacity in a slot, in the order of [`SHAPE`]; those of colours
+/// follow.
 pub(super) const SHAPE_GRADIENTS: usize = SHAPE;
 
 /// Floats in the shared memory that every device has.
@@ -47,13 +49,14 @@ impl SlotLayout {
         if self.shape { SHAPE_GRADIENTS } else { 0 }
     }
 
-    /// Floats in shared memory beside the partial sums: the batch, its targets and bits, and how far the blocks have
-    /// walked.
+    /// Floats in shared memory beside the partial sums: the batch, its targets and bits, and how
+    /// far the blocks have walked.
     fn batch(self, plan: Plan) -> usize {
         BATCH * (SHAPE + self.width) + 2 * BATCH + plan.blocks() * (WORDS + 1) + 2
     }
 
-    /// Splats whose partial sums are in shared memory at once: a power of two, so that they share a word of bits.
+    /// Splats whose partial sums are in shared memory at once: a power of two, so that they share a
+    /// word of bits.
     fn group(self, plan: Plan) -> usize {
         let room = SHARED.saturating_sub(self.batch(plan)).min(MAX_PARTIALS);
         let most = room / (self.values() * plan.blocks());
@@ -77,7 +80,8 @@ struct Pixels {
 
 #[cube]
 impl Pixels {
-    /// The pixels, and what they have walked to the `ends` of the blocks and the `longest` of the tile.
+    /// The pixels, and what they have walked to the `ends` of the blocks and the `longest` of the
+    /// tile.
     fn load(
         background: &ComptimeOption<&[f32]>,
         transmittance: &[f32],
@@ -136,8 +140,8 @@ impl Pixels {
         Pixels { t, behind, last, g }
     }
 
-    /// Sums over the pixels of the gradients of the splat that begins at `at`, whose place in the list is `entry`; the
-    /// pixels then stand before it.
+    /// Sums over the pixels of the gradients of the splat that begins at `at`, whose place in the
+    /// list is `entry`; the pixels then stand before it.
     fn gradients(
         &mut self,
         splats: &Shared<[f32]>,
@@ -223,7 +227,8 @@ impl Pixels {
     }
 }
 
-/// First entry of the list of the workgroup's tile, the same in all units, which have waited for each other.
+/// First entry of the list of the workgroup's tile, the same in all units, which have waited for
+/// each other.
 #[cube]
 fn first_of_tile(ranges: &[u32], grid: Grid, place: Place) -> u32 {
     let mut start = Shared::new_slice(1usize);
@@ -279,7 +284,8 @@ fn load_batch<A: Numeric>(
     }
 }
 
-/// The pixels walk the splats of a group that meet their block; the block's sums of each go to `partials`.
+/// The pixels walk the splats of a group that meet their block; the block's sums of each go to
+/// `partials`.
 #[cube]
 fn walk_group(
     pixels: &mut Pixels,
@@ -322,7 +328,8 @@ fn walk_group(
     }
 }
 
-/// One unit sums one value of one splat of a group over the blocks that have walked it; the sum goes to `target`.
+/// One unit sums one value of one splat of a group over the blocks that have walked it; the sum
+/// goes to `target`.
 #[cube]
 fn sum_group<A: Numeric>(
     target: &mut Target<A>,
@@ -377,8 +384,8 @@ fn sum_group<A: Numeric>(
     }
 }
 
-/// Gradients of every intersection: one workgroup per tile, back to front. They go to `target`, to splats as `sums`
-/// says.
+/// Gradients of every intersection: one workgroup per tile, back to front. They go to `target`, to
+/// splats as `sums` says.
 // Longer than a hundred lines by its arguments and those of the steps that it calls.
 #[cube(launch)]
 pub(super) fn rasterize_backward<A: Numeric>(

@@ -1,8 +1,8 @@
 //! Blending of a tile, front to back.
 //!
-//! Floor per (block, splat) pair: 24 bytes of shape and 4 per channel from shared memory; per pixel of the block about
-//! 30 operations and 2 per channel. Per intersection: 28 bytes and 4 per channel from memory; per pixel 12 bytes
-//! and 4 per channel to memory.
+//! Floor per (block, splat) pair: 24 bytes of shape and 4 per channel from shared memory; per pixel
+//! of the block about 30 operations and 2 per channel. Per intersection: 28 bytes and 4 per channel
+//! from memory; per pixel 12 bytes and 4 per channel to memory.
 
 use cubecl::prelude::*;
 
@@ -188,8 +188,8 @@ fn list_of_tile(ranges: &[u32], grid: Grid, place: Place) -> (u32, u32) {
     (start, end)
 }
 
-/// The pixels walk the splats of a batch that meet their block, until all have stopped; `next_entry` follows the place of
-/// its first splat in the list. Returns how many are open still.
+/// The pixels walk the splats of a batch that meet their block, until all have stopped;
+/// `next_entry` follows the place of its first splat in the list. Returns how many are open still.
 #[cube]
 fn walk_batch(
     pixels: &mut Pixels,
@@ -224,9 +224,9 @@ fn walk_batch(
     open_pixels
 }
 
-/// One workgroup per tile; `width` channels from `first_channel` on. Counting: instead of what is left of the light and
-/// of the splats walked, every pixel writes how many splats were tested for it and how many it blended, and as its alpha
-/// how many were past the alpha cut.
+/// One workgroup per tile; `width` channels from `first_channel` on. Counting: instead of what is
+/// left of the light and of the splats walked, every pixel writes how many splats were tested for
+/// it and how many it blended, and as its alpha how many were past the alpha cut.
 #[cube(launch)]
 pub(super) fn rasterize_forward(
     packed: &[f32],

@@ -14,10 +14,12 @@ pub struct Kept;
 impl Kept {
     /// Where the list begins and ends.
     pub const PER_TILE: u64 = 8;
-    /// Transmittance, and number of splats walked. The image has four bytes per channel and for alpha.
+    /// Transmittance, and number of splats walked. The image has four bytes per channel and for
+    /// alpha.
     pub const PER_PIXEL: u64 = 8;
 
-    /// For sums in order: place in the order of depth, and where the slots begin, twice: by splat and by place.
+    /// For sums in order: place in the order of depth, and where the slots begin, twice: by splat
+    /// and by place.
     pub const fn per_splat(sums: Sums) -> u64 {
         match sums {
             Sums::Ordered => 12,
@@ -25,8 +27,8 @@ impl Kept {
         }
     }
 
-    /// Splat, and for sums in order the slot, of all intersections that there was room for: up to a quarter more than there
-    /// are.
+    /// Splat, and for sums in order the slot, of all intersections that there was room for: up to a
+    /// quarter more than there are.
     pub const fn per_intersection(sums: Sums) -> u64 {
         match sums {
             Sums::Ordered => 8,
@@ -69,8 +71,8 @@ pub fn unordered(client: &Client) -> &'static str {
 /// (Pixel, splat) pairs of a forward pass.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Evaluations {
-    /// Pairs whose alpha was computed for a pixel that was still open: the splats of its tile whose ellipse meets its
-    /// block.
+    /// Pairs whose alpha was computed for a pixel that was still open: the splats of its tile whose
+    /// ellipse meets its block.
     pub tested: u64,
     /// Those of them past the alpha cut: blended, or the one that would leave too little light.
     pub seen: u64,
@@ -78,7 +80,8 @@ pub struct Evaluations {
     pub blended: u64,
 }
 
-/// Counts the evaluations of [`rasterize`](super::rasterize) by rendering once more; a measurement, which waits for the device.
+/// Counts the evaluations of [`rasterize`](super::rasterize) by rendering once more; a measurement,
+/// which waits for the device.
 ///
 /// # Errors
 /// The device's error, in words.

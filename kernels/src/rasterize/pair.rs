@@ -51,8 +51,8 @@ pub(super) struct Sample {
     pub raw: f32,
 }
 
-/// A splat at the pixel centre (x, y). Forward and backward both decide on this; fused multiply-adds are spelled out
-/// so that both are rounded alike.
+/// A splat at the pixel centre (x, y). Forward and backward both decide on this; fused
+/// multiply-adds are spelled out so that both are rounded alike.
 #[cube]
 pub(super) fn sample(shape: Shape, x: f32, y: f32) -> Sample {
     let dx = x - shape.mean_x;

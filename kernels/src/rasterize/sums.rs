@@ -1,11 +1,11 @@
 //! How the gradients of a splat's tiles become the splat's: in order, or as they come.
 //!
-//! In order, each intersection writes to its own slot, and then the slots of every splat are summed: the same bits
-//! every time. As they come, they are added to the splat's gradient by atomic additions, whose order differs from run to
-//! run: no slots, and nothing to be read again.
+//! In order, each intersection writes to its own slot, and then the slots of every splat are
+//! summed: the same bits every time. As they come, they are added to the splat's gradient by atomic
+//! additions, whose order differs from run to run: no slots, and nothing to be read again.
 //!
-//! Floor per intersection: in order 24 bytes and 4 per channel to memory, and once more from it; as they come 6
-//! additions and 1 per channel in memory.
+//! Floor per intersection: in order 24 bytes and 4 per channel to memory, and once more from it; as
+//! they come 6 additions and 1 per channel in memory.
 
 use cubecl::client::Client;
 use cubecl::features::AtomicUsage;
@@ -64,11 +64,13 @@ pub(super) struct SplatTarget<A: Numeric> {
     pub opacities: Box<[Atomic<A>]>,
 }
 
-/// Adds `value` to a float that other units add to, in memory that is an atomic float or an atomic integer of its bits.
+/// Adds `value` to a float that other units add to, in memory that is an atomic float or an atomic
+/// integer of its bits.
 ///
-/// Where floats cannot be added: what is there is taken out (zero stays) and put back with more; if something came in
-/// between, that is what is to be put next. Not by compare-and-swap: CubeCL's and WGSL's may fail although it found what
-/// it was to compare with, as on Metal, and tells no more than what it found, so that a sum would be lost.
+/// Where floats cannot be added: what is there is taken out (zero stays) and put back with more; if
+/// something came in between, that is what is to be put next. Not by compare-and-swap: CubeCL's and
+/// WGSL's may fail although it found what it was to compare with, as on Metal, and tells no more
+/// than what it found, so that a sum would be lost.
 #[cube]
 fn add<A: Numeric>(to: &Atomic<A>, value: f32, #[comptime] sums: Sums) {
     if comptime!(sums == Sums::Atomic) {
@@ -113,14 +115,15 @@ pub(super) fn add_to_splat<A: Numeric>(
     }
 }
 
-/// Where a gradient of the shape is in a packed splat: mean x, y are entries 0, 1; w11, w21, w22 are 3, 4, 5.
+/// Where a gradient of the shape is in a packed splat: mean x, y are entries 0, 1; w11, w21, w22
+/// are 3, 4, 5.
 #[cube]
 fn packed_entry(value: usize) -> usize {
     select(value < 2, value, value + 1)
 }
 
-/// Sums the slots of every visible splat in order, and spreads them over the gradients; those of the others are zero. One
-/// unit per (splat, value).
+/// Sums the slots of every visible splat in order, and spreads them over the gradients; those of
+/// the others are zero. One unit per (splat, value).
 #[cube(launch)]
 pub(super) fn sum_slots(
     slot_gradients: &[f32],

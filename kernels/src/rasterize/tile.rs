@@ -1,8 +1,8 @@
 //! How a workgroup shares out its tile, and the batches of splats that it reads together.
 //!
-//! The tile's pixels are cut into square *blocks*. The units that own a block walk only those splats of the batch whose
-//! ellipse meets the block, found by the same test that listed the splats of the tile. Every batch has one bit per
-//! (block, splat); a block's bits are its list.
+//! The tile's pixels are cut into square *blocks*. The units that own a block walk only those
+//! splats of the batch whose ellipse meets the block, found by the same test that listed the splats
+//! of the tile. Every batch has one bit per (block, splat); a block's bits are its list.
 
 use cubecl::client::Client;
 use cubecl::prelude::*;
@@ -21,8 +21,9 @@ pub(super) const WORDS: usize = BATCH / 32;
 /// How the pixels of a tile are dealt to the units of its workgroup.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub(super) struct Plan {
-    /// Units of a block. One: the block's gradients are summed where they arise, and no two units ever wait for each
-    /// other within a batch. A plane: they are summed by plane operations, and all units of a plane take the same way.
+    /// Units of a block. One: the block's gradients are summed where they arise, and no two units
+    /// ever wait for each other within a batch. A plane: they are summed by plane operations, and
+    /// all units of a plane take the same way.
     lanes: usize,
 }
 
@@ -43,9 +44,9 @@ impl Plan {
         self.lanes
     }
 
-    /// Most channels of one launch. What a unit keeps of them for all of its pixels, 128 floats at most, is to fit into
-    /// its registers. Without planes it is 256: measured on a software device, where memory is as near, 16 channels at
-    /// once take a fifth less time than 8 and 8.
+    /// Most channels of one launch. What a unit keeps of them for all of its pixels, 128 floats at
+    /// most, is to fit into its registers. Without planes it is 256: measured on a software device,
+    /// where memory is as near, 16 channels at once take a fifth less time than 8 and 8.
     pub fn channels(self) -> usize {
         let floats = if self.lanes == 1 { 256 } else { 128 };
         (floats / self.pixels()).min(MAX_CHANNELS)
@@ -125,7 +126,8 @@ fn corner(place: Place, block: u32, #[comptime] plan: Plan) -> (u32, u32) {
 
 #[cube]
 impl Place {
-    /// The unit's q-th pixel, in the image. With many units to a block all pixels of a unit have one x.
+    /// The unit's q-th pixel, in the image. With many units to a block all pixels of a unit have
+    /// one x.
     pub fn pixel(self, q: usize, #[comptime] plan: Plan) -> (u32, u32) {
         let (x, y) = corner(self, self.block, plan);
         let side = comptime!(plan.side() as u32);
@@ -139,7 +141,8 @@ impl Place {
     }
 }
 
-/// Whether a pixel is in the image, and its index over all cameras; that of some other pixel if not.
+/// Whether a pixel is in the image, and its index over all cameras; that of some other pixel if
+/// not.
 #[cube]
 pub(super) fn pixel_index(grid: Grid, place: Place, x: u32, y: u32) -> (bool, usize) {
     let inside = place.tile < grid.tiles && x < grid.width && y < grid.height;
@@ -177,8 +180,8 @@ impl Batch {
         }
     }
 
-    /// Reads `splat` to place `k`; its bits are set for the blocks it meets, of those for which `entry` is less than
-    /// `ends[block]`.
+    /// Reads `splat` to place `k`; its bits are set for the blocks it meets, of those for which
+    /// `entry` is less than `ends[block]`.
     pub fn load(
         &mut self,
         packed: &[f32],

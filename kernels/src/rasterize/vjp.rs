@@ -12,8 +12,8 @@ use super::{RasterizeInputs, RasterizeSettings, RasterizeState, Sums};
 use crate::intersect::{Frames, Slots};
 use crate::launch::{Buffer, cube_count, per_element};
 
-/// Most channels of one launch of the backward pass, of `most` that it could do: the slots of all intersections must fit into
-/// a buffer of `bytes`, and within reach of an index.
+/// Most channels of one launch of the backward pass, of `most` that it could do: the slots of all
+/// intersections must fit into a buffer of `bytes`, and within reach of an index.
 fn slot_channels(most: usize, bytes: u64, intersections: usize) -> usize {
     let floats = (bytes / 4).min(u64::from(u32::MAX));
     let values = (floats / intersections.max(1) as u64) as usize;
@@ -35,8 +35,9 @@ fn zeros(client: &Client, len: usize) -> Buffer {
     buffer
 }
 
-/// Gradients of packed splats [C, N, 9], colours [C, N, D], opacities [C, N] and background [C, D] for the gradient of
-/// the output [C, H, W, D + 1]; only those that `needs_grad` names. In order if `state` has slots.
+/// Gradients of packed splats [C, N, 9], colours [C, N, D], opacities [C, N] and background [C, D]
+/// for the gradient of the output [C, H, W, D + 1]; only those that `needs_grad` names. In order if
+/// `state` has slots.
 pub fn rasterize_vjp(
     client: &Client,
     inputs: &RasterizeInputs,

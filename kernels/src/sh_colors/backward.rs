@@ -15,7 +15,8 @@ const CENTER_ITEMS: usize = 4;
 /// Gaussians that one workgroup of it sums.
 const CENTER_BLOCK: usize = CUBE_UNITS_USIZE * CENTER_ITEMS;
 
-/// The gradient of a channel before the clamp: none below zero, unless it `recovers` and descent would raise it.
+/// The gradient of a channel before the clamp: none below zero, unless it `recovers` and descent
+/// would raise it.
 #[cube]
 fn passed_on_channel(color: f32, g: f32, #[comptime] recovers: bool) -> f32 {
     let mut stops = is_below_zero(color);
@@ -190,8 +191,8 @@ fn sh_colors_backward_centers<R: Float>(
     }
 }
 
-/// Gradients of sh0 [N, 1, 3], `sh_rest` [N, R, 3], means [N, 3] and centres [C, 3] for that of the colours [C, N, 3];
-/// only those that `needs_grad` names.
+/// Gradients of sh0 [N, 1, 3], `sh_rest` [N, R, 3], means [N, 3] and centres [C, 3] for that of the
+/// colours [C, N, 3]; only those that `needs_grad` names.
 pub fn sh_colors_backward(
     client: &Client,
     inputs: &ShColorInputs,

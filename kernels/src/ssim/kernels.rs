@@ -13,8 +13,8 @@ pub(super) const MOMENTS: usize = 4;
 /// Fields whose blur makes a gradient.
 pub(super) const FIELDS: usize = 3;
 
-/// Where a unit works: place of the line's first value, and how far along the line it begins. Units that lie beside
-/// each other take lines that do.
+/// Where a unit works: place of the line's first value, and how far along the line it begins. Units
+/// that lie beside each other take lines that do.
 #[cube]
 fn place(axis: Axis, unit: u32) -> (u32, u32) {
     let across = unit % axis.stride;
@@ -27,8 +27,8 @@ fn place(axis: Axis, unit: u32) -> (u32, u32) {
     )
 }
 
-/// Place of the value `ahead` of position `along - radius` of a line, and whether it lies on the line; the place of its
-/// first value if not.
+/// Place of the value `ahead` of position `along - radius` of a line, and whether it lies on the
+/// line; the place of its first value if not.
 #[cube]
 fn neighbour(axis: Axis, first: u32, along: u32, ahead: u32, radius: u32) -> (usize, bool) {
     let shifted = along + ahead;
@@ -233,8 +233,8 @@ pub(super) fn similarity_down_columns(
     }
 }
 
-/// g dS/dmean of the own image, g dS/dq and g dS/dp, windowed along the rows. `own` and `other`: first value of the
-/// means of the image whose gradient it is, and of the other one.
+/// g dS/dmean of the own image, g dS/dq and g dS/dp, windowed along the rows. `own` and `other`:
+/// first value of the means of the image whose gradient it is, and of the other one.
 #[cube(launch)]
 pub(super) fn fields_along_rows(
     moments: &[f32],

@@ -62,7 +62,8 @@ impl Values {
         [&self.param, &self.moments[0], &self.moments[1]]
     }
 
-    /// After a step, as bits; `held` keeps what went in from being overwritten, and must stay what it was.
+    /// After a step, as bits; `held` keeps what went in from being overwritten, and must stay what
+    /// it was.
     fn after(&self, client: &Client, rows: AdamRows, held: [bool; 3]) -> [Vec<u32>; 3] {
         let step = AdamStep { rows, ..STEP };
         let before = self.before().map(|values| upload(client, values));
@@ -98,7 +99,8 @@ fn bits(values: &[f32]) -> Vec<u32> {
 fn seen_rows_are_stepped_as_all_are_and_the_others_keep_every_bit() {
     let Some(client) = client() else { return };
     let nobody = [false; 3];
-    // Less than a workgroup, many of them, and rows that a workgroup's units do not divide, or do not cover.
+    // Less than a workgroup, many of them, and rows that a workgroup's units do not divide, or do
+    // not cover.
     for (rows, width) in [
         (7, 1),
         (1000, 1),

@@ -11,8 +11,8 @@ use cubecl::wgpu::{
 };
 use splat_kernels::MOST_BUFFERS;
 
-/// A client of the default wgpu adapter, software ones included; `None`, loudly, where there is none. With WGSL it binds
-/// as few buffers as the kernels say they can do with.
+/// A client of the default wgpu adapter, software ones included; `None`, loudly, where there is
+/// none. With WGSL it binds as few buffers as the kernels say they can do with.
 pub fn find() -> Option<Client> {
     // A process can open it once.
     static CLIENT: OnceLock<Option<Client>> = OnceLock::new();

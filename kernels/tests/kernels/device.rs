@@ -5,8 +5,8 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 use splat_kernels::Buffer;
 
-/// A client of the default wgpu adapter, software ones included, of which kernels take the way that this test program is
-/// about: with planes or without. `None`, loudly, where there is no adapter.
+/// A client of the default wgpu adapter, software ones included, of which kernels take the way that
+/// this test program is about: with planes or without. `None`, loudly, where there is no adapter.
 pub fn client() -> Option<Client> {
     let client = crate::adapter::find()?;
     splat_kernels::force_plane_size(Some(0));

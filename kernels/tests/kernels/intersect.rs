@@ -102,7 +102,8 @@ fn every_tile_with_a_visible_pixel_is_kept_and_hardly_any_other() {
         for splat in 0..frames.gaussians {
             let row = wide(&packed[splat * 9..splat * 9 + 9]);
             let opacity = f64::from(opacities[splat]);
-            // Largest alpha over pixel centres, and over a grid eight times as fine in the same rectangle.
+            // Largest alpha over pixel centres, and over a grid eight times as fine in the same
+            // rectangle.
             let best = |steps: u32| {
                 let mut best = 0.0f64;
                 let x1 = (x0 + TILE).min(frames.width) - 1;
@@ -142,7 +143,8 @@ fn splats_over_many_tiles_are_listed_by_all_units_together() {
         height: 330,
         alpha_min: ALPHA_MIN,
     };
-    // Every tenth is large: most of the picture, a disc over a few hundred tiles, or a needle across it.
+    // Every tenth is large: most of the picture, a disc over a few hundred tiles, or a needle
+    // across it.
     let mut rng = rng(23);
     let (mut packed, mut opacities) = (Vec::new(), Vec::new());
     for i in 0..2 * frames.gaussians {

@@ -1,5 +1,6 @@
-//! The kernels against the standard library and plain float64 references, on whatever wgpu adapter is there. Those that
-//! can use plane operations do without them here; `planes.rs` beside this has the others.
+//! The kernels against the standard library and plain float64 references, on whatever wgpu adapter
+//! is there. Those that can use plane operations do without them here; `planes.rs` beside this has
+//! the others.
 
 mod activation;
 mod adam;

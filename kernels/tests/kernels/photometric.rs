@@ -142,7 +142,8 @@ fn photos_of_any_kind_give_the_means_and_the_gradient_of_the_definition() {
         let wide: Vec<f64> = rendered.iter().map(|x| f64::from(*x)).collect();
         assert_close("means", &means, &reference(&wide, &photo, &shape), 2e-6);
         let d_ssim = |x: &[f64]| reference(x, &photo, &shape)[1];
-        // The absolute value has no slope where both are equal: one over the number of values elsewhere.
+        // The absolute value has no slope where both are equal: one over the number of values
+        // elsewhere.
         let mut expected = differences(&wide, 1e-5, |x| -1.3 * d_ssim(x));
         for (i, value) in expected.iter_mut().enumerate() {
             let (pixel, channel) = (i / shape.pixel, i % shape.pixel);

@@ -24,7 +24,8 @@ fn settings() -> ProjectSettings {
     }
 }
 
-/// Means, quats, scales, viewmats, intrinsics of a small scene with two cameras; some Gaussians are off-screen or behind.
+/// Means, quats, scales, viewmats, intrinsics of a small scene with two cameras; some Gaussians are
+/// off-screen or behind.
 fn scene(gaussians: usize) -> [Vec<f32>; 5] {
     let mut rng = rng(5);
     let mut means = uniform(&mut rng, gaussians * 3, -2.5, 2.5);
@@ -244,7 +245,8 @@ fn the_length_of_a_quaternion_does_not_matter() {
 #[test]
 fn needles_keep_their_determinant() {
     let Some(client) = client() else { return };
-    // 10 : 1e-3 : 1e-3 world units at depth 3, every orientation: thousands of pixels long, a fraction of one wide.
+    // 10 : 1e-3 : 1e-3 world units at depth 3, every orientation: thousands of pixels long, a
+    // fraction of one wide.
     let gaussians = 500;
     let quats = uniform(&mut rng(9), gaussians * 4, -1.0, 1.0);
     let [_, _, _, viewmats, intrinsics] = scene(1);

@@ -516,7 +516,8 @@ fn evaluations_are_counted() {
 /// Seconds of processor time that this process has used: other work on the machine does not count.
 fn processor_seconds() -> f64 {
     let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    // After the name in parentheses: utime and stime are entries 11 and 12, in hundredths of a second.
+    // After the name in parentheses: utime and stime are entries 11 and 12, in hundredths of a
+    // second.
     let fields = stat.rsplit(')').next().unwrap_or_default();
     let ticks = fields.split_whitespace().skip(11).take(2);
     ticks
@@ -525,7 +526,8 @@ fn processor_seconds() -> f64 {
         / 100.0
 }
 
-/// Prints processor times of the stages on a software device; run it by name with `--ignored --nocapture`.
+/// Prints processor times of the stages on a software device; run it by name with `--ignored
+/// --nocapture`.
 #[test]
 #[ignore = "a measurement, not a check"]
 fn time_of_the_stages_at_270_by_480() {

@@ -1,4 +1,5 @@
-//! Colours of coefficients in half precision: those of the same coefficients in single precision, bit for bit.
+//! Colours of coefficients in half precision: those of the same coefficients in single precision,
+//! bit for bit.
 
 use cubecl::client::Client;
 use splat_core::ShColorTensors;
@@ -63,7 +64,8 @@ fn halves_are_read_as_the_numbers_they_stand_for() {
             }
         })
         .collect();
-    // Zeros, the smallest, the largest below the normal ones, the smallest of these, the largest of all, infinity.
+    // Zeros, the smallest, the largest below the normal ones, the smallest of these, the largest of
+    // all, infinity.
     let odd = [0, 0x8000, 1, 0x8001, 0x03ff, 0x0400, 0x7bff, 0x7c00];
     halves[..odd.len()].copy_from_slice(&odd);
     let values: Vec<f32> = halves.iter().map(|half| single(*half)).collect();

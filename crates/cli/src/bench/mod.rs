@@ -86,7 +86,8 @@ fn chosen(global: &GlobalArgs) -> Result<Device, Failure> {
     }
 }
 
-/// The page of all benches of speed is about the CPU: another device is not what the user would get figures for.
+/// The page of all benches of speed is about the CPU: another device is not what the user would get
+/// figures for.
 fn cpu_only(global: &GlobalArgs) -> Result<(), Failure> {
     match global.device {
         DeviceChoice::Auto | DeviceChoice::Cpu => Ok(()),

@@ -29,7 +29,8 @@ pub(super) struct PerformanceArgs {
     capture: Option<PathBuf>,
     #[command(flatten)]
     input: CaptureArgs,
-    /// Scene whose lists the rasteriser works on: a PLY file [default: the capture's first Gaussians]
+    /// Scene whose lists the rasteriser works on: a PLY file [default: the capture's first
+    /// Gaussians]
     #[arg(long, value_name = "FILE")]
     scene: Option<PathBuf>,
     /// Also write the page PERFORMANCE.md and its pictures to this folder

@@ -11,8 +11,8 @@ use crate::report::metrics::write_json;
 use crate::report::probe_files;
 use splat_lab::performance::{device_step, step};
 
-/// The training step: time, stages, work; on the CPU with one thread and all, on a device with its launches, memory and
-/// share of the memory's bandwidth
+/// The training step: time, stages, work; on the CPU with one thread and all, on a device with its
+/// launches, memory and share of the memory's bandwidth
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   splat bench step

@@ -3,8 +3,8 @@
 /// Width of the longest bar in characters.
 const BAR: usize = 40;
 
-/// A histogram of `values` over `bins` equal bins of `[start, end]`, values outside counted into the first and last
-/// bin. One line a bin: its range, a bar, its share.
+/// A histogram of `values` over `bins` equal bins of `[start, end]`, values outside counted into
+/// the first and last bin. One line a bin: its range, a bar, its share.
 pub(super) fn histogram(
     values: impl Iterator<Item = f64>,
     start: f64,

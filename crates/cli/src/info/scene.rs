@@ -103,7 +103,8 @@ pub(super) fn middle(positions: Vec<[f64; 3]>) -> [[f64; 2]; 3] {
     })
 }
 
-/// The range of those `values` that are finite, widened to whole numbers; a flat Gaussian's scale is minus infinity.
+/// The range of those `values` that are finite, widened to whole numbers; a flat Gaussian's scale
+/// is minus infinity.
 fn whole_range(values: impl Iterator<Item = f64>) -> (f64, f64) {
     let range = values
         .filter(|value| value.is_finite())

@@ -97,8 +97,9 @@ impl FileCamera {
     }
 }
 
-/// `count` cameras on a level circle about the middle of the scene, looking at it. Up is -y, as in the frame of a
-/// camera held upright. The middle is the median of each axis; the circle holds nine tenths of the scene in view.
+/// `count` cameras on a level circle about the middle of the scene, looking at it. Up is -y, as in
+/// the frame of a camera held upright. The middle is the median of each axis; the circle holds nine
+/// tenths of the scene in view.
 pub(super) fn orbit(scene: &SplatData, count: u32) -> Vec<(String, Camera)> {
     let origin = DVec3::from(scene.origin);
     let middle = DVec3::from_array(std::array::from_fn(|axis| {

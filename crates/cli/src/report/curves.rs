@@ -1,4 +1,5 @@
-//! The course of a run as one SVG: loss terms, held-out PSNR and number of Gaussians against the step.
+//! The course of a run as one SVG: loss terms, held-out PSNR and number of Gaussians against the
+//! step.
 
 use std::ops::Range;
 use std::path::Path;
@@ -141,7 +142,8 @@ impl Panel {
     }
 }
 
-/// At most [`MOST_POINTS`] points, each the mean of a stretch; values that are not finite are left out.
+/// At most [`MOST_POINTS`] points, each the mean of a stretch; values that are not finite are left
+/// out.
 fn thinned(points: &[(usize, f64)]) -> Vec<(f64, f64)> {
     let finite: Vec<(f64, f64)> = points
         .iter()
@@ -156,7 +158,8 @@ fn thinned(points: &[(usize, f64)]) -> Vec<(f64, f64)> {
     finite.chunks(stretch).map(mean).collect()
 }
 
-/// The range of `values`, a twentieth wider on each side and never empty; nothing where there is no value.
+/// The range of `values`, a twentieth wider on each side and never empty; nothing where there is no
+/// value.
 fn padded(values: impl Iterator<Item = f64>) -> Option<Range<f64>> {
     let (least, most) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |range, value| {
         (range.0.min(value), range.1.max(value))

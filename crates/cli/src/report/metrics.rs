@@ -10,8 +10,8 @@ use splat_trainer::Scores;
 /// Everything in `metrics.json`, in the order of its fields.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Metrics {
-    /// Quality on the held-out views: `psnr`, `ssim`, `views`. What does not exist (the mean over no view) or is infinite
-    /// (the PSNR of a perfect copy) is `null`.
+    /// Quality on the held-out views: `psnr`, `ssim`, `views`. What does not exist (the mean over
+    /// no view) or is infinite (the PSNR of a perfect copy) is `null`.
     #[serde(flatten)]
     pub scores: Scores,
     /// Number of Gaussians of the scene.
@@ -22,9 +22,11 @@ pub struct Metrics {
     pub seconds: f64,
     /// Seconds a step took on average.
     pub seconds_per_step: f64,
-    /// Most memory that was resident, `null` where the system does not say ([`super::memory::peak_rss_bytes`]).
+    /// Most memory that was resident, `null` where the system does not say
+    /// ([`super::memory::peak_rss_bytes`]).
     pub peak_rss_bytes: Option<u64>,
-    /// Memory that a CubeCL device's allocator held at the end, what it keeps for reuse included; `null` elsewhere.
+    /// Memory that a CubeCL device's allocator held at the end, what it keeps for reuse included;
+    /// `null` elsewhere.
     pub device_bytes: Option<u64>,
     /// What was computed on.
     pub device: String,

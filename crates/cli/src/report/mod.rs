@@ -1,7 +1,8 @@
 //! What a run leaves behind and shows: pictures, curves, figures, progress.
 //!
-//! Everything is written by [`write_atomically`](splat_data::write_atomically): beside its place first, then renamed, so that an interrupted run
-//! leaves either the old file or the new one; what cannot be made again by [`write_durably`](splat_data::write_durably).
+//! Everything is written by [`write_atomically`](splat_data::write_atomically): beside its place
+//! first, then renamed, so that an interrupted run leaves either the old file or the new one; what
+//! cannot be made again by [`write_durably`](splat_data::write_durably).
 
 pub mod curves;
 mod inputs;

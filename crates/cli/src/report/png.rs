@@ -26,7 +26,8 @@ impl Picture {
         Self::from_rgb8(width, height, values.iter().map(|&v| to_byte(v)).collect())
     }
 
-    /// From `[height, width]` values such as alpha or a scaled depth; clamped to `[0, 1]`, NaN as 0.
+    /// From `[height, width]` values such as alpha or a scaled depth; clamped to `[0, 1]`, NaN as
+    /// 0.
     ///
     /// # Errors
     ///

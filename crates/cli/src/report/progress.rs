@@ -1,4 +1,5 @@
-//! Progress of long work: a bar on a terminal, a plain line every so often elsewhere, nothing when quiet.
+//! Progress of long work: a bar on a terminal, a plain line every so often elsewhere, nothing when
+//! quiet.
 //!
 //! All of it goes to standard error, so that standard output holds results alone.
 
@@ -54,7 +55,8 @@ impl Progress {
         }
     }
 
-    /// Says that `done` steps are done; `message` (such as the loss) is only built where it is shown.
+    /// Says that `done` steps are done; `message` (such as the loss) is only built where it is
+    /// shown.
     pub fn update(&mut self, done: u64, message: impl FnOnce() -> String) {
         match &mut self.output {
             Output::Bar(bar) => {
@@ -98,7 +100,8 @@ fn plain_line(done: u64, total: u64, here: u64, elapsed: Duration, message: &str
     line
 }
 
-/// Writes a line that is no result. That nobody reads it (a closed pipe) is no error, and ends no run.
+/// Writes a line that is no result. That nobody reads it (a closed pipe) is no error, and ends no
+/// run.
 pub(crate) fn tell(line: &str) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }

@@ -6,7 +6,8 @@ use std::path::Path;
 /// Bytes of a name's stem at most; systems take 255 for a whole name.
 const MOST_BYTES: usize = 220;
 
-/// Stems of the files of several views, all different, also where a file system takes upper and lower case for one.
+/// Stems of the files of several views, all different, also where a file system takes upper and
+/// lower case for one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ViewNames {
     /// For every view, in the order given: the name of its picture without `.png`.
@@ -16,11 +17,12 @@ pub struct ViewNames {
 }
 
 impl ViewNames {
-    /// Names the pictures of the views called `names`. A picture is written to the stem, one of `suffixes` and `.png`; no two
-    /// of these files are one.
+    /// Names the pictures of the views called `names`. A picture is written to the stem, one of
+    /// `suffixes` and `.png`; no two of these files are one.
     ///
-    /// The stem is the view's name without its ending, in one folder: separators become `_`. Views that would share a file
-    /// get theirs with the ending of their name (`shot_jpg`, `shot_png`), or, where that is one too, with a number.
+    /// The stem is the view's name without its ending, in one folder: separators become `_`. Views
+    /// that would share a file get theirs with the ending of their name (`shot_jpg`, `shot_png`),
+    /// or, where that is one too, with a number.
     pub fn new<'a>(names: impl IntoIterator<Item = &'a str>, suffixes: &[&str]) -> Self {
         let names: Vec<&str> = names.into_iter().collect();
         let suffixes: BTreeSet<&&str> = suffixes.iter().collect();

@@ -1,7 +1,9 @@
-//! The folder of a run: tried before the first step, written to when the run ends or is interrupted.
+//! The folder of a run: tried before the first step, written to when the run ends or is
+//! interrupted.
 //!
-//! What is worth most comes first: the scene, then the checkpoint, then what can be made again from them. Whatever
-//! cannot be saved, the rest is tried. The checkpoint is removed when all else is there, and not before.
+//! What is worth most comes first: the scene, then the checkpoint, then what can be made again from
+//! them. Whatever cannot be saved, the rest is tried. The checkpoint is removed when all else is
+//! there, and not before.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -64,7 +66,8 @@ impl Saving {
 }
 
 impl RunFolder<'_> {
-    /// Tries whether everything can be written, before it is worth anything, and without replacing a photo.
+    /// Tries whether everything can be written, before it is worth anything, and without replacing
+    /// a photo.
     pub(super) fn probe(&self, capture: &Capture) -> Result<(), ReportError> {
         let pictures = picture_names(capture).stems;
         let pictures = pictures.iter().map(|stem| self.picture(stem));
@@ -115,8 +118,8 @@ impl RunFolder<'_> {
         self.outcome(saving)
     }
 
-    /// Keeps a complete run, measures it, and removes its checkpoint. The scores, if they could be measured, and whether
-    /// everything could be saved.
+    /// Keeps a complete run, measures it, and removes its checkpoint. The scores, if they could be
+    /// measured, and whether everything could be saved.
     pub(super) fn complete(
         &self,
         trained: &Trained,
@@ -127,7 +130,8 @@ impl RunFolder<'_> {
         let mut saving = Saving::default();
         let scene = self.save_scene(&mut saving, trained);
         if !scene && self.folder.join(SCENE).exists() {
-            // Beside the scene of another run nothing of this one may lie but what it can be gone on with from.
+            // Beside the scene of another run nothing of this one may lie but what it can be gone
+            // on with from.
             saving.keep(CHECKPOINT, self.save_checkpoint(trained));
             return (None, self.outcome(saving));
         }

@@ -77,8 +77,8 @@ fn not_resumable(given: &Path, checkpoint: &Path) -> Option<String> {
     }
 }
 
-/// Refuses to write to a folder that holds the checkpoint of another run than the `resumed` one: it is all there is of
-/// that run.
+/// Refuses to write to a folder that holds the checkpoint of another run than the `resumed` one: it
+/// is all there is of that run.
 pub(super) fn refuse_unfinished(out: &Path, resumed: Option<&Path>) -> Result<(), Failure> {
     let path = out.join(CHECKPOINT);
     let same = |other: &Path| match (other.canonicalize(), path.canonicalize()) {

@@ -16,7 +16,8 @@ const RESULTS: [&str; 5] = [
     "curves.svg",
 ];
 
-/// `splat --device cpu train` with these arguments, in the folder of `capture`, which it writes `out` to.
+/// `splat --device cpu train` with these arguments, in the folder of `capture`, which it writes
+/// `out` to.
 fn training(capture: &Path, out: &str, more: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_splat"));
     command
@@ -278,7 +279,8 @@ fn a_run_is_gone_on_with_as_it_was_begun_or_not_at_all() {
     let elsewhere = resume(&capture, "out", &["--out", "done", "--seed", "8"]);
     refused(elsewhere, &["seed = 7, not 8"]);
 
-    // The file itself is as good as its folder; settings beside it that somebody changed are not the run's.
+    // The file itself is as good as its folder; settings beside it that somebody changed are not
+    // the run's.
     fs::write(out.join("config.toml"), "seed = 9").unwrap();
     let more = ["--steps", "100", "--max-gaussians", "10"];
     let output = resume(&capture, "out/checkpoint.safetensors", &more);
@@ -428,7 +430,8 @@ fn a_full_disk_takes_no_more_than_it_must() {
     assert!(read("none", "scene.ply").is_err());
 }
 
-/// When all steps are done and a result cannot be saved, the checkpoint is left, and with it the rest is done later.
+/// When all steps are done and a result cannot be saved, the checkpoint is left, and with it the
+/// rest is done later.
 #[test]
 fn a_run_whose_results_could_not_be_saved_is_finished_later() {
     let folder = TempDir::new().unwrap();
@@ -511,7 +514,8 @@ fn a_scenes_settings_stay_with_the_scene() {
     fs::remove_file(out.join("config.toml")).unwrap();
     assert_eq!(eval(&first).0, table);
 
-    // A scene that does not say is asked of its config.toml, and one that is not a run's is passed over with a word.
+    // A scene that does not say is asked of its config.toml, and one that is not a run's is passed
+    // over with a word.
     let bytes = fs::read(&first).unwrap();
     let silent = String::from_utf8_lossy(&bytes[..600]).into_owned();
     let end = silent.find("element").unwrap();

@@ -22,8 +22,8 @@ pub struct Case {
 /// How a case is checked.
 #[derive(Clone, Copy)]
 pub(super) enum Check {
-    /// Image, alpha and every gradient of these scenes against double precision. The named groups have a gradient of
-    /// zero by symmetry.
+    /// Image, alpha and every gradient of these scenes against double precision. The named groups
+    /// have a gradient of zero by symmetry.
     Scenes(fn() -> Vec<Scene>, &'static [&'static str]),
     /// In its own way.
     Own(fn(&Device) -> Result<Outcome, AccuracyError>),

@@ -101,8 +101,8 @@ pub(super) fn double(scene: &Scene) -> Result<Computed, AccuracyError> {
     Ok(run(scene, &Device::flex(), Precision::F64, None)?)
 }
 
-/// Image, alpha and every gradient of `scene` on `device` in single precision, against double precision; groups named
-/// in `zero` have a gradient of zero by symmetry, which rounding hides.
+/// Image, alpha and every gradient of `scene` on `device` in single precision, against double
+/// precision; groups named in `zero` have a gradient of zero by symmetry, which rounding hides.
 pub(super) fn against_double(
     scene: &Scene,
     device: &Device,
@@ -185,8 +185,9 @@ pub(super) fn gradients(computed: &Computed) -> Vec<f64> {
     .collect()
 }
 
-/// The first scene of `make`, by seed, whose every pixel keeps a relative distance of `margin` to every threshold in
-/// double precision: what remains is rounding error, not the flip of a pixel. The last one tried if none does.
+/// The first scene of `make`, by seed, whose every pixel keeps a relative distance of `margin` to
+/// every threshold in double precision: what remains is rounding error, not the flip of a pixel.
+/// The last one tried if none does.
 pub(super) fn clear(margin: f64, make: impl Fn(u64) -> Scene) -> Scene {
     clear_but(0, margin, make)
 }

@@ -25,8 +25,8 @@
 //! - the integral is over the whole line, as EWA's is. Of a Gaussian whose mean is 4 standard
 //!   deviations away along the ray, less than 4e-5 lies behind the camera.
 //!
-//! Depth order (camera z of the mean), `alpha_min`, `alpha_max`, early stop and background are those
-//! of [`splat_ops::rasterize`]. There is no low-pass filter: a pixel is a point. Compare with
+//! Depth order (camera z of the mean), `alpha_min`, `alpha_max`, early stop and background are
+//! those of [`splat_ops::rasterize`]. There is no low-pass filter: a pixel is a point. Compare with
 //! [`render_affine`] at `eps2d` 0 for the model alone, at 0.3 for model and filter.
 //!
 //! A measuring tool: no gradients, every Gaussian at every pixel.

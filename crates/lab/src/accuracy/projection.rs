@@ -1,4 +1,5 @@
-//! How exact the projection of extreme Gaussians is in single precision, over as many random ones as one likes.
+//! How exact the projection of extreme Gaussians is in single precision, over as many random ones
+//! as one likes.
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
@@ -22,7 +23,8 @@ const EDGE: f64 = 1e-4;
 /// What the projection of random extreme Gaussians found.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct ProjectionErrors {
-    /// Gaussians tried: axes of 1e-4 to 1e4 pixels, up to 1e4 : 1, in every direction, quaternions of any length.
+    /// Gaussians tried: axes of 1e-4 to 1e4 pixels, up to 1e4 : 1, in every direction, quaternions
+    /// of any length.
     pub gaussians: usize,
     /// Those that double precision sees.
     pub visible: usize,
@@ -34,7 +36,8 @@ pub struct ProjectionErrors {
     pub exponent: f64,
 }
 
-/// Projects `gaussians` random extreme Gaussians in single precision on `device` and in double precision on the CPU.
+/// Projects `gaussians` random extreme Gaussians in single precision on `device` and in double
+/// precision on the CPU.
 ///
 /// # Errors
 /// When the op refuses its input or results cannot be read back.
@@ -96,7 +99,8 @@ fn exponent(row: &[f64], [x, y]: [f64; 2]) -> f64 {
     (z1 * z1 + z2 * z2) / 2.0
 }
 
-/// A random point of the picture where the splat's falloff is above 1/255: on its ridge, moved across it.
+/// A random point of the picture where the splat's falloff is above 1/255: on its ridge, moved
+/// across it.
 fn on_the_splat(row: &[f64], rng: &mut Pcg64Mcg) -> Option<[f64; 2]> {
     let x: f64 = rng.random_range(0.0..f64::from(SIZE.width));
     let across: f64 = rng.random_range(-3.3..3.3);

@@ -49,7 +49,8 @@ pub struct Row {
     pub worst_group: String,
     /// Whether the case's demand holds.
     pub holds: bool,
-    /// Seconds of forward and backward of the case's scenes, with upload and read-back; absent where nothing is rendered.
+    /// Seconds of forward and backward of the case's scenes, with upload and read-back; absent
+    /// where nothing is rendered.
     pub seconds: Option<f64>,
     /// (Pixel, splat) pairs blended in that time, forward.
     pub blended: u64,
@@ -76,7 +77,8 @@ impl Report {
     /// Measures everything; `each` hears of every case before it runs.
     ///
     /// # Errors
-    /// When a device or an op refuses what it should take. An inaccurate result is a row that does not hold.
+    /// When a device or an op refuses what it should take. An inaccurate result is a row that does
+    /// not hold.
     pub fn measure(
         backends: &[Backend],
         mut each: impl FnMut(&Backend, &Case),
@@ -231,7 +233,8 @@ impl Report {
         Ok(())
     }
 
-    /// Error against time, both logarithmic: a point per case and backend, labelled with the case's number.
+    /// Error against time, both logarithmic: a point per case and backend, labelled with the case's
+    /// number.
     ///
     /// # Errors
     /// What the drawing library says.

@@ -1,4 +1,5 @@
-//! Builds scenes by what they look like: splats are placed at a pixel and a depth, and sized in pixels.
+//! Builds scenes by what they look like: splats are placed at a pixel and a depth, and sized in
+//! pixels.
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
@@ -42,8 +43,8 @@ pub(crate) struct Sketch {
 }
 
 impl Sketch {
-    /// An empty scene before a camera at the world's origin; focal length a power of two, the principal point in the
-    /// middle.
+    /// An empty scene before a camera at the world's origin; focal length a power of two, the
+    /// principal point in the middle.
     pub fn new(name: &'static str, width: u32, height: u32, seed: u64) -> Self {
         let focal = f64::from(width.max(height)).log2().round().exp2();
         Self {
@@ -138,7 +139,8 @@ impl Sketch {
         &mut self.blobs[last]
     }
 
-    /// Adds `count` random splats all over the picture, axes of 1 to 4 pixels, well separated in depth.
+    /// Adds `count` random splats all over the picture, axes of 1 to 4 pixels, well separated in
+    /// depth.
     pub fn scatter(&mut self, count: usize, opacity: (f64, f64)) {
         let (width, height) = (f64::from(self.size.width), f64::from(self.size.height));
         let mut depths: Vec<f64> = (0..count)

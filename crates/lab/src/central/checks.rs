@@ -74,7 +74,8 @@ pub(super) fn check_outputs(outputs: &[Array]) -> Result<(), CheckError> {
     Ok(())
 }
 
-/// Both evaluations agree to nine digits of the largest element: the pass with gradients may sum in another order.
+/// Both evaluations agree to nine digits of the largest element: the pass with gradients may sum in
+/// another order.
 pub(super) fn check_repeats(outputs: &[Array], again: &[Array]) -> Result<(), CheckError> {
     for (output, (first, second)) in outputs.iter().zip(again).enumerate() {
         let most = first

@@ -2,7 +2,8 @@
 
 use std::path::PathBuf;
 
-/// What keeps a function from being checked. A wrong gradient is no error: it is a finding of the [`Report`](super::Report).
+/// What keeps a function from being checked. A wrong gradient is no error: it is a finding of the
+/// [`Report`](super::Report).
 #[derive(Debug, thiserror::Error)]
 pub enum CheckError {
     /// The function returned an error.

@@ -1,4 +1,5 @@
-//! A function of another framework: inputs, outputs, upstream gradients, and the gradients that they gave.
+//! A function of another framework: inputs, outputs, upstream gradients, and the gradients that
+//! they gave.
 
 use std::path::{Path, PathBuf};
 
@@ -12,7 +13,8 @@ use super::outputs::Outputs;
 use super::report::{Comparison, Coverage, Finding, Kind, Report, Row};
 use crate::gradcheck::{Array, check_unique_names, index_of};
 
-/// Relative difference of an element that passes, to the larger of itself and the root mean square of its tensor.
+/// Relative difference of an element that passes, to the larger of itself and the root mean square
+/// of its tensor.
 const TOLERANCE: f64 = 1e-9;
 
 /// A file that `scripts/fixtures.py` wrote of a PyTorch function.
@@ -23,8 +25,8 @@ const TOLERANCE: f64 = 1e-9;
 /// | `grad.x` | the expected gradient of the input `x`; an input without one is a constant |
 /// | `grad_y` | the upstream gradient of the output `y` |
 ///
-/// All of them are F64 (F32 is read, too). The metadata entry `outputs` has the names of the outputs in order, with commas
-/// between.
+/// All of them are F64 (F32 is read, too). The metadata entry `outputs` has the names of the
+/// outputs in order, with commas between.
 #[derive(Debug, Clone)]
 pub struct Fixture {
     file: PathBuf,
@@ -42,13 +44,14 @@ struct Output {
     upstream: Array,
 }
 
-/// Compares a function with a file that `scripts/fixtures.py` wrote of its PyTorch twin: outputs and gradients, to 1e-9.
+/// Compares a function with a file that `scripts/fixtures.py` wrote of its PyTorch twin: outputs
+/// and gradients, to 1e-9.
 ///
 /// The function gets the file's inputs by name and returns its outputs in the file's order.
 ///
 /// # Errors
-/// When the file is no such fixture, the function fails, or its outputs have other shapes. A wrong value is no error: it is
-/// in the report.
+/// When the file is no such fixture, the function fails, or its outputs have other shapes. A wrong
+/// value is no error: it is in the report.
 ///
 /// # Panics
 /// When the function does, or asks for an input that the file does not have.
@@ -78,8 +81,8 @@ impl Fixture {
     /// Reads a file.
     ///
     /// # Errors
-    /// When it cannot be read, is no safetensors file, or holds something that would not be checked. The message names the
-    /// file and the tensor.
+    /// When it cannot be read, is no safetensors file, or holds something that would not be
+    /// checked. The message names the file and the tensor.
     pub fn read(path: impl AsRef<Path>) -> Result<Self, CheckError> {
         let file = path.as_ref().to_path_buf();
         Self::parse(&file).map_err(|reason| CheckError::Fixture { file, reason })
@@ -146,7 +149,8 @@ impl Fixture {
         })
     }
 
-    /// Relative difference that passes, to the larger of an element and the root mean square of its tensor; 1e-9 by default.
+    /// Relative difference that passes, to the larger of an element and the root mean square of its
+    /// tensor; 1e-9 by default.
     pub fn with_tolerance(mut self, tolerance: f64) -> Self {
         self.tolerance = tolerance;
         self
@@ -157,7 +161,8 @@ impl Fixture {
         self.inputs.clone()
     }
 
-    /// The upstream gradients of all outputs, for [`Settings::with_upstream`](super::Settings::with_upstream).
+    /// The upstream gradients of all outputs, for
+    /// [`Settings::with_upstream`](super::Settings::with_upstream).
     pub fn upstream(&self) -> Vec<f64> {
         let outputs = self.outputs.iter();
         outputs.flat_map(|o| o.upstream.values.clone()).collect()

@@ -17,7 +17,8 @@ pub(super) trait Function {
     /// The outputs.
     fn outputs(&self, inputs: &Inputs) -> Result<Vec<Array>, CheckError>;
 
-    /// The outputs, and the gradients of their sum under `weights`: by input, `None` where autodiff has none.
+    /// The outputs, and the gradients of their sum under `weights`: by input, `None` where autodiff
+    /// has none.
     fn gradients(
         &self,
         inputs: &Inputs,

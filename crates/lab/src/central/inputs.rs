@@ -6,7 +6,8 @@ use crate::gradcheck::Array;
 
 /// A tensor of the kind that checks compute with: double precision, on the CPU, known to autodiff.
 ///
-/// For what a function needs beside its inputs. Tensors of another device or precision do not mix with them.
+/// For what a function needs beside its inputs. Tensors of another device or precision do not mix
+/// with them.
 ///
 /// # Panics
 /// When there are not as many values as the shape has elements.
@@ -20,8 +21,8 @@ pub fn tensor<const D: usize>(values: impl Into<Vec<f64>>, shape: [usize; D]) ->
     Tensor::from_data(TensorData::new(values.into(), shape), (&device, DType::F64))
 }
 
-/// Inputs whose number and ranks are known only when the program runs. Where they are known before, a tuple of pairs
-/// `("name", tensor)` is shorter: see [`Arguments`].
+/// Inputs whose number and ranks are known only when the program runs. Where they are known before,
+/// a tuple of pairs `("name", tensor)` is shorter: see [`Arguments`].
 ///
 /// ```
 /// use burn::tensor::Tensor;
@@ -47,7 +48,8 @@ impl Inputs {
         Self::default()
     }
 
-    /// These and one more, of any float type and on any device. Its values are kept in double precision.
+    /// These and one more, of any float type and on any device. Its values are kept in double
+    /// precision.
     ///
     /// # Panics
     /// When the tensor cannot be read back.

@@ -8,7 +8,8 @@ use super::report::Kind;
 const KINK: f64 = 1e-6;
 /// A derivative that is known less well than this part of itself is not known.
 const UNKNOWN: f64 = 1e-2;
-/// Nor does it matter, where a change of the input by its own size changes the outputs by less than this part of theirs.
+/// Nor does it matter, where a change of the input by its own size changes the outputs by less than
+/// this part of theirs.
 const NEGLIGIBLE: f64 = 1e-6;
 
 /// What is known of a line before it is followed. All per unit of the line.

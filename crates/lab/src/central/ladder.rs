@@ -1,8 +1,9 @@
 //! The derivative along one line, from differences at smaller and smaller steps.
 //!
-//! Each step is a quarter of the one before. Richardson's extrapolation takes the powers of the step out of the differences,
-//! and of all values in its tableau the one with the smallest estimated error is kept (Ridders 1982). Large steps are exact
-//! for smooth functions; small ones are what is left where a kink is near.
+//! Each step is a quarter of the one before. Richardson's extrapolation takes the powers of the
+//! step out of the differences, and of all values in its tableau the one with the smallest
+//! estimated error is kept (Ridders 1982). Large steps are exact for smooth functions; small ones
+//! are what is left where a kink is near.
 
 use super::noise::{Extent, Noise};
 
@@ -47,8 +48,8 @@ pub(super) struct Enough {
     pub jump: f64,
 }
 
-/// Goes down from the step `first` until the errors are `enough`, or as small as rounding allows. `None` where no two steps
-/// in a row can be used: `sample` says so by `None`.
+/// Goes down from the step `first` until the errors are `enough`, or as small as rounding allows.
+/// `None` where no two steps in a row can be used: `sample` says so by `None`.
 pub(super) fn climb_down<E>(
     first: f64,
     noise: Noise,
@@ -125,7 +126,8 @@ impl Tableau {
         for (column, before) in std::mem::take(&mut self.row).into_iter().enumerate() {
             let last = next[column];
             let value = last + (last - before) / (falls - 1.0);
-            // The first difference is that of two steps; a further one that of two extrapolations, too.
+            // The first difference is that of two steps; a further one that of two extrapolations,
+            // too.
             let differs = match column {
                 0 => f64::INFINITY,
                 _ => (value - last).abs().max((value - before).abs()),

@@ -19,8 +19,8 @@ pub(super) struct Line<'a> {
 
 /// Evaluates a function along lines, under fixed weights of its outputs.
 ///
-/// Outputs are subtracted element by element before they are summed. What does not change cancels exactly, and rounding is
-/// that of the elements, not that of their sum.
+/// Outputs are subtracted element by element before they are summed. What does not change cancels
+/// exactly, and rounding is that of the elements, not that of their sum.
 pub(super) struct Probe<'a> {
     function: &'a dyn Function,
     inputs: Inputs,

@@ -1,4 +1,5 @@
-//! Gradient checks of any function of Burn tensors, by central differences in double precision on the CPU.
+//! Gradient checks of any function of Burn tensors, by central differences in double precision on
+//! the CPU.
 //!
 //! ```
 //! use splat_lab::central::{gradcheck, tensor};
@@ -23,11 +24,12 @@
 //! # Ok::<(), splat_lab::central::CheckError>(())
 //! ```
 //!
-//! The outputs are summed under fixed random weights. One backward pass gives the analytic gradient. The numeric one comes
-//! from central differences at steps that shrink, extrapolated, with an estimate of their error (`ladder.rs`). An element
-//! passes if both agree to that error and a tolerance. Inputs of more than 1000 elements are moved along random directions,
-//! and a disagreement is followed to its element (`search.rs`). Where the slopes on the left and on the right differ, the
-//! point is named as a kink.
+//! The outputs are summed under fixed random weights. One backward pass gives the analytic
+//! gradient. The numeric one comes from central differences at steps that shrink, extrapolated,
+//! with an estimate of their error (`ladder.rs`). An element passes if both agree to that error and
+//! a tolerance. Inputs of more than 1000 elements are moved along random directions, and a
+//! disagreement is followed to its element (`search.rs`). Where the slopes on the left and on the
+//! right differ, the point is named as a kink.
 //!
 //! [`Fixture`] compares with gradients from elsewhere, [`check_against_fixture`] in one call.
 
@@ -62,14 +64,15 @@ use search::Search;
 
 /// Checks the gradient of a function at the given inputs, with default [`Settings`].
 ///
-/// - `function`: any closure of tensors that returns a tensor, a tuple of up to four, or a `Result` of either. It is
-///   evaluated in double precision on the CPU. What else it needs comes from [`tensor`].
+/// - `function`: any closure of tensors that returns a tensor, a tuple of up to four, or a `Result`
+///   of either. It is evaluated in double precision on the CPU. What else it needs comes from
+///   [`tensor`].
 /// - `inputs`: named tensors of any ranks, float types and devices, see [`Arguments`].
 ///
 /// # Errors
-/// When the function returns an error, gives values or gradients that are not finite, gives different values when called
-/// again, or computes in another precision; or when an input is empty, not finite, or named twice. A wrong gradient is no
-/// error: it is in the report.
+/// When the function returns an error, gives values or gradients that are not finite, gives
+/// different values when called again, or computes in another precision; or when an input is empty,
+/// not finite, or named twice. A wrong gradient is no error: it is in the report.
 ///
 /// # Panics
 /// When the function does.
@@ -171,7 +174,8 @@ fn check(
     })
 }
 
-/// Weights of the outputs' elements: those of the settings, or random ones from 0.5 to 1 of either sign.
+/// Weights of the outputs' elements: those of the settings, or random ones from 0.5 to 1 of either
+/// sign.
 fn weights(shapes: &[Vec<usize>], settings: &Settings) -> Result<Vec<f64>, CheckError> {
     let count = shapes
         .iter()

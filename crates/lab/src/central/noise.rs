@@ -15,7 +15,8 @@ pub(super) struct Extent {
 }
 
 impl Extent {
-    /// Both. An output that changes at a large step is rounded at a small one too, where it may not seem to change.
+    /// Both. An output that changes at a large step is rounded at a small one too, where it may not
+    /// seem to change.
     pub(super) fn or(self, other: Self) -> Self {
         Self {
             size: self.size.max(other.size),
@@ -62,8 +63,8 @@ impl Noise {
     }
 }
 
-/// What rounding makes of differences at a step of one, from those at the smallest steps: `|change of the difference| * step`,
-/// at most.
+/// What rounding makes of differences at a step of one, from those at the smallest steps: `|change
+/// of the difference| * step`, at most.
 pub(super) fn noise_at_the_bottom<E>(
     first: f64,
     mut sample: impl FnMut(f64) -> Result<Option<Sample>, E>,

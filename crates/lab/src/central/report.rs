@@ -22,10 +22,11 @@ pub struct Row {
     pub shape: Vec<usize>,
     /// How it was looked at.
     pub coverage: Coverage,
-    /// The comparison that came closest to failing, or failed most; `None` where nothing was compared.
+    /// The comparison that came closest to failing, or failed most; `None` where nothing was
+    /// compared.
     pub worst: Option<Comparison>,
-    /// Whether every derivative is exactly zero, on both sides: the function does not depend on this input at this point, so
-    /// that not much was checked.
+    /// Whether every derivative is exactly zero, on both sides: the function does not depend on
+    /// this input at this point, so that not much was checked.
     pub all_zero: bool,
     /// What is wrong, and kinks. No more than eight; then there may be more.
     pub findings: Vec<Finding>,
@@ -40,8 +41,8 @@ pub enum Coverage {
     Directions {
         /// How many.
         count: usize,
-        /// The smallest error of a single element's derivative that is surely seen, in units of the root mean square
-        /// derivative; both times the element's size.
+        /// The smallest error of a single element's derivative that is surely seen, in units of the
+        /// root mean square derivative; both times the element's size.
         limit: f64,
     },
     /// Not at all: it is a constant.
@@ -86,7 +87,8 @@ pub enum Kind {
         /// Whether it passes: the analytic derivative lies between both, and kinks are not refused.
         accepted: bool,
     },
-    /// The numeric derivative cannot be told: a discontinuity, noise, or a function that changes faster than the steps.
+    /// The numeric derivative cannot be told: a discontinuity, noise, or a function that changes
+    /// faster than the steps.
     Unresolved,
     /// The function is not finite at any step beside this point.
     OutsideDomain,
@@ -135,7 +137,8 @@ impl Report {
         self.rows.iter().find(|row| row.name == name)
     }
 
-    /// The largest difference of any row's worst comparison, relative to the larger of both derivatives.
+    /// The largest difference of any row's worst comparison, relative to the larger of both
+    /// derivatives.
     pub fn worst_relative(&self) -> f64 {
         let worst = self.rows.iter().filter_map(|row| row.worst.as_ref());
         worst.map(Comparison::relative).fold(0.0, f64::max)

@@ -1,9 +1,10 @@
 //! Looks for wrong elements: one by one in small inputs, by halving in large ones.
 //!
-//! In a large input all elements are moved at once, by their size with random signs. The analytic derivative along such a
-//! direction costs nothing, as one backward pass gives the whole gradient; one wrong element changes it by its error, which
-//! the sum of all others does not hide, because differences are exact to many digits. Where they disagree, halves of the
-//! elements are moved, and so on down to one.
+//! In a large input all elements are moved at once, by their size with random signs. The analytic
+//! derivative along such a direction costs nothing, as one backward pass gives the whole gradient;
+//! one wrong element changes it by its error, which the sum of all others does not hide, because
+//! differences are exact to many digits. Where they disagree, halves of the elements are moved, and
+//! so on down to one.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -122,7 +123,8 @@ impl Search<'_, '_> {
         Ok(())
     }
 
-    /// Random directions, and the elements where they disagree. An element that was found does not move any more.
+    /// Random directions, and the elements where they disagree. An element that was found does not
+    /// move any more.
     fn along_directions(&mut self, known: Known, row: &mut Row) -> Result<(), CheckError> {
         let n = known.sizes.len();
         let (mut most_severe, mut limit) = (-1.0, f64::INFINITY);
@@ -205,8 +207,8 @@ impl Search<'_, '_> {
         }))
     }
 
-    /// Moves of all elements by their size or half of it, with random signs. Two sizes, so that equal errors of opposite
-    /// sign rarely cancel.
+    /// Moves of all elements by their size or half of it, with random signs. Two sizes, so that
+    /// equal errors of opposite sign rarely cancel.
     fn direction(&self, sizes: &[f64], number: u64) -> Vec<f64> {
         let seed = self.settings.seed ^ (number << 32) ^ ((self.input as u64) << 48);
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
@@ -214,8 +216,8 @@ impl Search<'_, '_> {
         sizes.iter().map(move_).collect()
     }
 
-    /// How strongly rounding acts. The least of several tries, each with about half of the elements, because one that crosses
-    /// a kink or a jump takes that for noise.
+    /// How strongly rounding acts. The least of several tries, each with about half of the
+    /// elements, because one that crosses a kink or a jump takes that for noise.
     fn noise(&mut self, sizes: &[f64]) -> Result<Noise, CheckError> {
         let mut least: Option<Noise> = None;
         for number in 0..NOISE_TRIES {
@@ -293,8 +295,8 @@ impl Search<'_, '_> {
         }
     }
 
-    /// The error of one element that would have been seen, in units of the root mean square derivative. Half a size is the
-    /// least that an element moves.
+    /// The error of one element that would have been seen, in units of the root mean square
+    /// derivative. Half a size is the least that an element moves.
     fn limit(&self, followed: &Followed) -> f64 {
         let (Some(slope), rms) = (&followed.slope, followed.analytic.rms) else {
             return f64::INFINITY;

@@ -45,8 +45,9 @@ impl Settings {
 
     /// Relative difference between analytic and numeric derivative that passes; 1e-7 by default.
     ///
-    /// Of an element it is relative to its own derivative, and a thousandth of that to the root mean square of its input's.
-    /// Along a direction over many elements it is relative to the root of the sum of the squares of their derivatives.
+    /// Of an element it is relative to its own derivative, and a thousandth of that to the root
+    /// mean square of its input's. Along a direction over many elements it is relative to the root
+    /// of the sum of the squares of their derivatives.
     pub fn with_tolerance(mut self, tolerance: f64) -> Self {
         self.tolerance = tolerance;
         self
@@ -58,21 +59,23 @@ impl Settings {
         self
     }
 
-    /// The largest step, relative to the size of an element; 1/64 by default. Smaller ones follow, each a quarter of the one
-    /// before, until the error is small. Choose it smaller for a function that cannot be evaluated so far from its inputs.
+    /// The largest step, relative to the size of an element; 1/64 by default. Smaller ones follow,
+    /// each a quarter of the one before, until the error is small. Choose it smaller for a function
+    /// that cannot be evaluated so far from its inputs.
     pub fn with_step(mut self, step: f64) -> Self {
         self.step = step;
         self
     }
 
-    /// Inputs of at most this many elements are checked element by element, larger ones along directions; 1000 by default.
+    /// Inputs of at most this many elements are checked element by element, larger ones along
+    /// directions; 1000 by default.
     pub fn with_each_up_to(mut self, elements: usize) -> Self {
         self.each_up_to = elements;
         self
     }
 
-    /// Random directions over all elements of a large input; 4 by default. One finds nearly every wrong element; more of
-    /// them make it less likely that errors of two elements cancel.
+    /// Random directions over all elements of a large input; 4 by default. One finds nearly every
+    /// wrong element; more of them make it less likely that errors of two elements cancel.
     pub fn with_directions(mut self, directions: usize) -> Self {
         self.directions = directions;
         self
@@ -90,8 +93,8 @@ impl Settings {
         self
     }
 
-    /// Weights of the outputs' elements in the sum that is differentiated: outputs in order, each row-major. Random ones,
-    /// of both signs and none near zero, by default.
+    /// Weights of the outputs' elements in the sum that is differentiated: outputs in order, each
+    /// row-major. Random ones, of both signs and none near zero, by default.
     pub fn with_upstream(mut self, upstream: impl Into<Vec<f64>>) -> Self {
         self.upstream = Some(upstream.into());
         self

@@ -36,7 +36,8 @@ pub struct Fixture {
     pub case: String,
     /// Marked by its author as numerically hard: judged more mildly in single precision.
     pub hard: bool,
-    /// What is rendered and differentiated; `upstream.depth` is zero where the file has a depth without a gradient.
+    /// What is rendered and differentiated; `upstream.depth` is zero where the file has a depth
+    /// without a gradient.
     pub scene: Scene,
     /// What the reference rendered.
     pub expected: Outputs,
@@ -51,8 +52,8 @@ impl Fixture {
     /// `sh_degree` the highest.
     ///
     /// # Errors
-    /// When the file cannot be read, a tensor is missing, has a wrong type or shape or a value
-    /// that is not finite, or a metadata entry does not parse; also where the file holds something that
+    /// When the file cannot be read, a tensor is missing, has a wrong type or shape or a value that
+    /// is not finite, or a metadata entry does not parse; also where the file holds something that
     /// would not be checked. The message names file and tensor.
     pub fn read(path: &Path) -> Result<Self, GradcheckError> {
         let bytes = std::fs::read(path).map_err(|source| GradcheckError::Read {

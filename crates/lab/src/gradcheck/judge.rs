@@ -84,9 +84,9 @@ pub struct FileReport {
     pub groups: Vec<GroupReport>,
     /// image, alpha and, where the fixture has it, depth.
     pub outputs: Vec<OutputReport>,
-    /// Pixels near a threshold. In single precision those that its rounding of an alpha or a transmittance may decide
-    /// differently: they are left out, of the pictures and of the loss. In double precision those within 1e-6, relatively:
-    /// they count like any other.
+    /// Pixels near a threshold. In single precision those that its rounding of an alpha or a
+    /// transmittance may decide differently: they are left out, of the pictures and of the loss. In
+    /// double precision those within 1e-6, relatively: they count like any other.
     pub near_threshold: usize,
     /// Pixels in all.
     pub pixels: usize,

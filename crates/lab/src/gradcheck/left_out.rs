@@ -1,9 +1,10 @@
 //! A check in single precision: the pixels that it may decide differently are left out.
 //!
-//! Where alpha or transmittance lies within single precision's rounding of a threshold, a splat may be blended in one
-//! precision and not in the other, and neither is wrong. The upstream gradient of these pixels counts in neither side:
-//! ours in double precision, which must itself match the file with every pixel counted, then stands for the reference
-//! without them. The file's pictures are compared without them too. More than a hundredth of all pixels may not be.
+//! Where alpha or transmittance lies within single precision's rounding of a threshold, a splat may
+//! be blended in one precision and not in the other, and neither is wrong. The upstream gradient of
+//! these pixels counts in neither side: ours in double precision, which must itself match the file
+//! with every pixel counted, then stands for the reference without them. The file's pictures are
+//! compared without them too. More than a hundredth of all pixels may not be.
 
 use burn::tensor::Device;
 

@@ -6,8 +6,8 @@
 //!
 //! In single precision, pixels on a threshold of blending are left out (`left_out.rs`).
 //!
-//! The fixtures come from PyTorch in float64 (`tests/fixtures/generate.py`); any framework can write one.
-//! [`check_file`] does it all for one file.
+//! The fixtures come from PyTorch in float64 (`tests/fixtures/generate.py`); any framework can
+//! write one. [`check_file`] does it all for one file.
 
 mod fixture;
 mod judge;
@@ -124,12 +124,12 @@ pub enum GradcheckError {
     },
 }
 
-/// Reads a fixture, renders it on a device, takes the gradients and judges them; with a known [`Bug`]
-/// switched on as a negative control.
+/// Reads a fixture, renders it on a device, takes the gradients and judges them; with a known
+/// [`Bug`] switched on as a negative control.
 ///
 /// # Errors
-/// When the file is not a valid fixture, or the device or the ops refuse it. A wrong gradient is
-/// no error: it is a report with `pass` false.
+/// When the file is not a valid fixture, or the device or the ops refuse it. A wrong gradient is no
+/// error: it is a report with `pass` false.
 pub fn check_file(
     path: &Path,
     device: &Device,
@@ -141,8 +141,9 @@ pub fn check_file(
 
 /// [`check_file`] on a fixture in memory.
 ///
-/// In single precision the pixels that rounding may decide differently are left out, see [`FileReport::near_threshold`]. That
-/// takes double precision on the CPU: built without the feature `cpu`, every pixel counts.
+/// In single precision the pixels that rounding may decide differently are left out, see
+/// [`FileReport::near_threshold`]. That takes double precision on the CPU: built without the
+/// feature `cpu`, every pixel counts.
 ///
 /// # Errors
 /// When the device or the ops refuse the scene.

@@ -52,7 +52,8 @@ pub struct Inputs {
     pub background: Array,
 }
 
-/// Rendered pictures of a fixture, or their upstream gradients; C in front where the viewmat has it.
+/// Rendered pictures of a fixture, or their upstream gradients; C in front where the viewmat has
+/// it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outputs {
     /// `[H, W, 3]`.

@@ -1,5 +1,5 @@
-//! Walks every pixel of a scene splat by splat: counts the work, and the pixels where one rounding error more or less
-//! decides whether a splat is blended.
+//! Walks every pixel of a scene splat by splat: counts the work, and the pixels where one rounding
+//! error more or less decides whether a splat is blended.
 
 use super::rounding;
 use super::run::Computed;
@@ -19,8 +19,8 @@ pub struct Walk {
     pub blended: u64,
 }
 
-/// Walks every splat against every pixel, in double precision, from the screen splats of `computed`. A value within
-/// `near` of a threshold, relatively, is near it.
+/// Walks every splat against every pixel, in double precision, from the screen splats of
+/// `computed`. A value within `near` of a threshold, relatively, is near it.
 pub fn walk(scene: &Scene, computed: &Computed, near: f64) -> Walk {
     let mut total = Walk::default();
     walk_pixels(scene, computed, Margin::Relative(near), |_, pixel| {
@@ -31,8 +31,9 @@ pub fn walk(scene: &Scene, computed: &Computed, near: f64) -> Walk {
     total
 }
 
-/// The pixels that single precision may decide differently, as indices into `[C, H, W]`: there an alpha or a
-/// transmittance of `computed`, which is in double precision, lies within single precision's rounding of a threshold.
+/// The pixels that single precision may decide differently, as indices into `[C, H, W]`: there an
+/// alpha or a transmittance of `computed`, which is in double precision, lies within single
+/// precision's rounding of a threshold.
 pub fn near_in_single(scene: &Scene, computed: &Computed) -> Vec<usize> {
     let mut found = vec![];
     walk_pixels(scene, computed, Margin::Single, |index, pixel| {

@@ -1,4 +1,5 @@
-//! What the blending could reach on this machine at this time: tiles full of splats, everything in cache.
+//! What the blending could reach on this machine at this time: tiles full of splats, everything in
+//! cache.
 
 use std::panic::resume_unwind;
 use std::thread;
@@ -20,8 +21,8 @@ const TILES: usize = 64;
 /// Passes that are measured, after one that is not.
 const PASSES: usize = 30;
 
-/// 1e9 pairs per second and thread, forward and backward: the rasteriser's own loops without lists to walk, spans to
-/// find, or memory to wait for.
+/// 1e9 pairs per second and thread, forward and backward: the rasteriser's own loops without lists
+/// to walk, spans to find, or memory to wait for.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Arithmetic {
     /// Blending.
@@ -89,8 +90,8 @@ fn alone() -> Result<Arithmetic, PerformanceError> {
     })
 }
 
-/// Packed splats, colours and opacities of every tile, tracked. So wide that every pixel passes every test, and so faint
-/// that light is left behind the last one.
+/// Packed splats, colours and opacities of every tile, tracked. So wide that every pixel passes
+/// every test, and so faint that light is left behind the last one.
 fn splats(device: &Device) -> [Tensor<3>; 3] {
     let (deviation, middle) = (20.0, TILE as f32 / 2.0);
     let tensor = |width: usize, row: &dyn Fn(usize) -> Vec<f32>| {

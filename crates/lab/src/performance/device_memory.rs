@@ -1,8 +1,9 @@
 //! Memory that training takes on a CubeCL device, by the allocator's own count.
 //!
-//! Between steps there are, of every Gaussian of degree 3: 59 floats that are trained, two moments of each, and two sums
-//! for density control. Within a step come its gradients, what is projected, and what the rasteriser keeps; of the latter
-//! `splat_kernels::rasterize::Kept` has the bytes per Gaussian, instance and pixel.
+//! Between steps there are, of every Gaussian of degree 3: 59 floats that are trained, two moments
+//! of each, and two sums for density control. Within a step come its gradients, what is projected,
+//! and what the rasteriser keeps; of the latter `splat_kernels::rasterize::Kept` has the bytes per
+//! Gaussian, instance and pixel.
 
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
@@ -10,8 +11,8 @@ use serde::{Deserialize, Serialize};
 use super::PerformanceError;
 use splat_trainer::Trainer;
 
-/// Floats of a Gaussian that are trained: mean, scale, rotation, opacity, colour; and the coefficients of the higher
-/// degrees, all of them as soon as one is evaluated.
+/// Floats of a Gaussian that are trained: mean, scale, rotation, opacity, colour; and the
+/// coefficients of the higher degrees, all of them as soon as one is evaluated.
 pub(super) const fn parameters(sh_degree: usize) -> u64 {
     let higher = if sh_degree == 0 { 0 } else { 45 };
     3 + 3 + 4 + 1 + 3 + higher
@@ -29,14 +30,16 @@ pub struct DeviceMemory {
     pub gaussians: u64,
     /// Bytes in use between two steps, without what others had in use before the run.
     pub at_rest_bytes: u64,
-    /// The most seen in use at the beginning or end of a stage, likewise. Within a stage it may be more.
+    /// The most seen in use at the beginning or end of a stage, likewise. Within a stage it may be
+    /// more.
     pub most_bytes: u64,
     /// Bytes that the allocator has taken from the device so far, for whatever will be needed.
     pub reserved_bytes: u64,
 }
 
 impl DeviceMemory {
-    /// Of a run between two steps, `before` bytes in use when it began and `most` during some of its steps.
+    /// Of a run between two steps, `before` bytes in use when it began and `most` during some of
+    /// its steps.
     pub(super) fn of(
         trainer: &Trainer,
         device: &Device,

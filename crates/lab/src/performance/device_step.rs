@@ -1,5 +1,5 @@
-//! A training step on a CubeCL device: its time, what the kernels were asked to do, how near it comes to what the
-//! device's memory allows, and the memory it takes.
+//! A training step on a CubeCL device: its time, what the kernels were asked to do, how near it
+//! comes to what the device's memory allows, and the memory it takes.
 
 use std::fmt::Write;
 use std::sync::Arc;
@@ -56,7 +56,8 @@ pub struct DeviceStepRow {
     pub milliseconds: Spread,
     /// Mean time of steps that follow each other as in training, the last waited for.
     pub milliseconds_in_a_row: f64,
-    /// Launches of our kernels per step, waits of the host for them, instances listed, bytes reserved.
+    /// Launches of our kernels per step, waits of the host for them, instances listed, bytes
+    /// reserved.
     pub launches: f64,
     /// How often the host waited.
     pub waits: f64,
@@ -70,8 +71,8 @@ pub struct DeviceStepRow {
     pub floor_bytes: u64,
     /// Share of a step in a row that a copy would need to move them.
     pub share_of_floor: f64,
-    /// Median time of each stage, in the order in which they end; last what no stage covers. The device was waited for
-    /// before and after every stage.
+    /// Median time of each stage, in the order in which they end; last what no stage covers. The
+    /// device was waited for before and after every stage.
     pub stages: Vec<(String, f64)>,
     /// Memory on the device.
     pub memory: DeviceMemory,
@@ -90,8 +91,8 @@ fn is_software(_: &Device) -> bool {
     true
 }
 
-/// Measures steps of `capture` on `device` at degree 0, with which training begins, and 3, with which it ends. `seconds`
-/// bounds the time of each way of measuring, as far as three steps do.
+/// Measures steps of `capture` on `device` at degree 0, with which training begins, and 3, with
+/// which it ends. `seconds` bounds the time of each way of measuring, as far as three steps do.
 ///
 /// # Errors
 /// When the capture cannot be trained on, or the device is none of CubeCL or fails.

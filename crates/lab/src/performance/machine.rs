@@ -65,8 +65,8 @@ fn available() -> Vec<&'static str> {
     }
 }
 
-/// The day that is so many days after 1970-01-01, in the Gregorian calendar. Years begin in March, so that the leap day
-/// is the last of a year; 400 of them are 146,097 days.
+/// The day that is so many days after 1970-01-01, in the Gregorian calendar. Years begin in March,
+/// so that the leap day is the last of a year; 400 of them are 146,097 days.
 fn date(days: u64) -> String {
     let days = days + 719_468;
     let (era, day) = (days / 146_097, days % 146_097);
@@ -105,8 +105,8 @@ impl Usage {
         }
     }
 
-    /// The tenth field of `/proc/self/stat`, and the sum of the fourteenth and fifteenth, in the system's fixed ticks of
-    /// 10 ms; the second is a name in brackets that may hold anything.
+    /// The tenth field of `/proc/self/stat`, and the sum of the fourteenth and fifteenth, in the
+    /// system's fixed ticks of 10 ms; the second is a name in brackets that may hold anything.
     fn parse(stat: &str) -> Option<Self> {
         let (_, after_name) = stat.rsplit_once(')')?;
         let fields: Vec<&str> = after_name.split_whitespace().collect();

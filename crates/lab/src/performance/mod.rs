@@ -1,8 +1,9 @@
-//! How fast it is, what the time goes to, and how that grows: `splat bench step|rasterize|scaling`, on the CPU or on a
-//! CubeCL device.
+//! How fast it is, what the time goes to, and how that grows: `splat bench step|rasterize|scaling`,
+//! on the CPU or on a CubeCL device.
 //!
-//! Nothing here is a copy of what it measures: steps are those of the [`Trainer`](splat_trainer::Trainer), and their stages are
-//! the `tracing` spans in it and in the ops.
+//! Nothing here is a copy of what it measures: steps are those of the
+//! [`Trainer`](splat_trainer::Trainer), and their stages are the `tracing` spans in it and in the
+//! ops.
 
 mod arithmetic;
 mod device_memory;

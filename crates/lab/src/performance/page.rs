@@ -18,8 +18,8 @@ pub struct PerformanceReport {
 }
 
 impl PerformanceReport {
-    /// The page. `arguments` are those of the command that writes it, of `bench step`, and of `bench rasterize`, each
-    /// with a space before.
+    /// The page. `arguments` are those of the command that writes it, of `bench step`, and of
+    /// `bench rasterize`, each with a space before.
     pub fn markdown(&self, arguments: [&str; 3]) -> String {
         let [all, step, rasterize] = arguments;
         let bench = "cargo run --release -- bench";

@@ -1,5 +1,5 @@
-//! The rasteriser: (pixel, Gaussian) evaluations per second and core (or per CubeCL device), on the lists of a real
-//! scene.
+//! The rasteriser: (pixel, Gaussian) evaluations per second and core (or per CubeCL device), on the
+//! lists of a real scene.
 
 use std::fmt::Write;
 use std::time::{Duration, Instant};
@@ -30,8 +30,8 @@ const PASSES: usize = 30;
 /// 1e9 evaluations per second and core.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Limit {
-    /// What the arithmetic of the inner loop reached on a machine with AVX-512: a tile of 16 x 16 pixels with 256 splats,
-    /// in cache, forward and backward. Not all of it was measured.
+    /// What the arithmetic of the inner loop reached on a machine with AVX-512: a tile of 16 x 16
+    /// pixels with 256 splats, in cache, forward and backward. Not all of it was measured.
     reached: [Option<f64>; 2],
     /// What the rasteriser shall reach, forward and backward.
     goal: Option<[f64; 2]>,
@@ -55,8 +55,8 @@ const BASELINE: Limit = Limit {
 /// The same of scalar code with libm, forward.
 const SCALAR: f64 = 0.1;
 
-/// The limit of the instructions that ran. None was measured for NEON, whose vectors are half of AVX2's; it is held
-/// against AVX2.
+/// The limit of the instructions that ran. None was measured for NEON, whose vectors are half of
+/// AVX2's; it is held against AVX2.
 fn limit(instructions: InstructionSet) -> Limit {
     match instructions {
         InstructionSet::Avx512 => AVX512,
@@ -92,7 +92,8 @@ pub struct RasterizeRow {
     limit: Option<Limit>,
     /// Passes over the views.
     pub passes: usize,
-    /// Tile lists, milliseconds per view. Absent where the rasteriser does not time them apart from the blending.
+    /// Tile lists, milliseconds per view. Absent where the rasteriser does not time them apart from
+    /// the blending.
     pub lists: Option<Spread>,
     /// Blending, with the lists where these are not apart.
     pub forward: Rate,
@@ -100,13 +101,14 @@ pub struct RasterizeRow {
     pub backward: Rate,
     /// Its gradient again, summed as it comes; of a CubeCL device only.
     pub backward_unordered: Option<Rate>,
-    /// What the order costs: the time of `backward` by that of `backward_unordered`, one after the other on each view and
-    /// summed over the views of a pass.
+    /// What the order costs: the time of `backward` by that of `backward_unordered`, one after the
+    /// other on each view and summed over the views of a pass.
     pub cost_of_order: Option<Spread>,
-    /// What so many threads of the CPU reach side by side without lists, spans and memory; absent where a device rendered.
+    /// What so many threads of the CPU reach side by side without lists, spans and memory; absent
+    /// where a device rendered.
     pub possible: Option<Arithmetic>,
-    /// Milliseconds per view of projection, colours and rasteriser together, and of their gradients; of a CubeCL device
-    /// only, idle before and after.
+    /// Milliseconds per view of projection, colours and rasteriser together, and of their
+    /// gradients; of a CubeCL device only, idle before and after.
     pub render_forward_milliseconds: Option<Spread>,
     /// See above.
     pub render_backward_milliseconds: Option<Spread>,
@@ -135,8 +137,9 @@ impl Rate {
     }
 }
 
-/// Measures the rasteriser of `device` on up to eight of `views`, that of the CPU on one thread and on all; `seconds`
-/// bounds the time of each. A CubeCL device is waited for where the rasteriser begins and ends.
+/// Measures the rasteriser of `device` on up to eight of `views`, that of the CPU on one thread and
+/// on all; `seconds` bounds the time of each. A CubeCL device is waited for where the rasteriser
+/// begins and ends.
 ///
 /// # Errors
 /// When the scene cannot be rendered.
@@ -263,8 +266,8 @@ impl Pass {
     }
 }
 
-/// Renders the views and goes back through them, again and again; a CubeCL device three times: waited for by stages, with
-/// sums in order and without, and as a whole.
+/// Renders the views and goes back through them, again and again; a CubeCL device three times:
+/// waited for by stages, with sums in order and without, and as a whole.
 fn passes(
     data: &SplatData,
     views: &[&View],

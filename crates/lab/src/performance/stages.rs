@@ -44,16 +44,17 @@ struct Open {
 }
 
 impl Recording {
-    /// Records the spans of `work` on this thread; those that other threads enter are part of the one that waits for
-    /// them here.
+    /// Records the spans of `work` on this thread; those that other threads enter are part of the
+    /// one that waits for them here.
     pub fn of<R>(work: impl FnOnce(&Self) -> R) -> R {
         let recording = Self::default();
         let subscriber = Registry::default().with(recording.clone());
         with_default(subscriber, || work(&recording))
     }
 
-    /// The same, where `work` is done by a device that goes on while the host does: each span begins and ends when the
-    /// device has nothing left to do. What else runs side by side is lost to the whole.
+    /// The same, where `work` is done by a device that goes on while the host does: each span
+    /// begins and ends when the device has nothing left to do. What else runs side by side is lost
+    /// to the whole.
     pub fn on_device<R>(device: &Device, work: impl FnOnce(&Self) -> R) -> R {
         let recording = Self {
             device: Some(device.clone()),
@@ -63,7 +64,8 @@ impl Recording {
         with_default(subscriber, || work(&recording))
     }
 
-    /// The most bytes in use where a span began or ended, by the device's own count; zero without a device that counts.
+    /// The most bytes in use where a span began or ended, by the device's own count; zero without a
+    /// device that counts.
     pub fn most_in_use(&self) -> u64 {
         self.spans().most_in_use
     }

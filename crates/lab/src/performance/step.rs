@@ -17,9 +17,11 @@ use splat_data::Capture;
 use splat_data::View;
 use splat_trainer::{TrainConfig, Trainer};
 
-/// Steps before the clock starts: caches and the allocator fill, spherical harmonics reach their degree.
+/// Steps before the clock starts: caches and the allocator fill, spherical harmonics reach their
+/// degree.
 const WARM_UP: usize = 5;
-/// Steps measured of one run. Fewer than until density control first changes the number of Gaussians.
+/// Steps measured of one run. Fewer than until density control first changes the number of
+/// Gaussians.
 const STEPS: usize = 20;
 /// Steps measured of one setting, over its runs, unless time is up.
 const MOST_STEPS: usize = 200;
@@ -54,16 +56,16 @@ pub struct StepRow {
     pub milliseconds: Spread,
     /// Median time of each stage, in the order in which they end; last what no stage covers.
     pub stages: Vec<(String, f64)>,
-    /// Processor time of all threads per step; on an idle machine, that of the step times the threads, as far as these
-    /// have work. Absent where the system does not say.
+    /// Processor time of all threads per step; on an idle machine, that of the step times the
+    /// threads, as far as these have work. Absent where the system does not say.
     pub cpu_milliseconds: Option<f64>,
     /// Pages of fresh memory per step.
     pub page_faults: Option<f64>,
 }
 
-/// Measures steps of `capture` at degree 0, with which training begins, and 3, with which it ends; on one thread and on
-/// all. `seconds` bounds the time spent on each of these settings, as far as a run of 20 steps does; `say` hears of
-/// each.
+/// Measures steps of `capture` at degree 0, with which training begins, and 3, with which it ends;
+/// on one thread and on all. `seconds` bounds the time spent on each of these settings, as far as a
+/// run of 20 steps does; `say` hears of each.
 ///
 /// # Errors
 /// When the capture cannot be trained on.
@@ -106,7 +108,8 @@ pub fn measure(
     })
 }
 
-/// A run of the usual length that evaluates spherical harmonics of degree 0, or of 3 from the fourth step on.
+/// A run of the usual length that evaluates spherical harmonics of degree 0, or of 3 from the
+/// fourth step on.
 pub(super) fn at_degree(config: &TrainConfig, sh_degree: usize) -> TrainConfig {
     let usual = TrainConfig::default();
     TrainConfig {
@@ -186,7 +189,8 @@ impl Samples {
         }
     }
 
-    /// Median time of each stage in milliseconds, in the order in which they end; last what no stage covers.
+    /// Median time of each stage in milliseconds, in the order in which they end; last what no
+    /// stage covers.
     pub(super) fn stages(&self) -> Vec<(String, f64)> {
         let mut names: Vec<&str> = vec![];
         for stage in self.steps.iter().flat_map(|(_, stages)| stages) {
@@ -244,7 +248,8 @@ pub(super) fn run(
 }
 
 impl StepReport {
-    /// How many times faster all threads are than one, by degree of spherical harmonics: (degree, threads, ratio).
+    /// How many times faster all threads are than one, by degree of spherical harmonics: (degree,
+    /// threads, ratio).
     pub fn speed_ups(&self) -> Vec<(usize, usize, f64)> {
         let one = |degree| {
             let mut rows = self.rows.iter();

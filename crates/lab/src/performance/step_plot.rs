@@ -107,7 +107,8 @@ fn draw_legend<'a>(
     Ok(())
 }
 
-/// Colours that neighbours can be told apart by: hues a golden section of the circle apart, dark and light in turn.
+/// Colours that neighbours can be told apart by: hues a golden section of the circle apart, dark
+/// and light in turn.
 fn color_of(index: usize) -> RGBAColor {
     let hue = (index as f64 * 0.381_966).fract();
     HSLColor(hue, 0.55, if index.is_multiple_of(2) { 0.45 } else { 0.65 }).to_rgba()

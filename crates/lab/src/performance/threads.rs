@@ -4,8 +4,8 @@ use rayon::ThreadPoolBuilder;
 
 use super::PerformanceError;
 
-/// Runs `work` in a pool of so many threads. Burn's Flex and our ops take the pool that they are called in; only the
-/// calls themselves must not come from outside.
+/// Runs `work` in a pool of so many threads. Burn's Flex and our ops take the pool that they are
+/// called in; only the calls themselves must not come from outside.
 ///
 /// # Errors
 /// When the system has no such threads, or the work fails.

@@ -23,7 +23,8 @@ pub struct Work {
     pub pixels: f64,
     /// (pixel, Gaussian) pairs that the inner loop evaluates.
     pub tested: f64,
-    /// Those past the alpha cut; as [`RasterizeWork`](splat_ops::RasterizeWork) has it, beyond the image's edges too.
+    /// Those past the alpha cut; as [`RasterizeWork`](splat_ops::RasterizeWork) has it, beyond the
+    /// image's edges too.
     pub seen: f64,
     /// Those blended.
     pub blended: f64,
@@ -101,7 +102,8 @@ mod tests {
     use super::*;
     use crate::performance::scaling::{PhotoSize, synthetic_capture};
 
-    /// Pairs past the cut and pairs blended, from the definition: every splat at every pixel, in double precision.
+    /// Pairs past the cut and pairs blended, from the definition: every splat at every pixel, in
+    /// double precision.
     fn by_hand(projected: Vec<f32>, opacities: Vec<f32>, [width, height]: [u32; 2]) -> [f64; 2] {
         let mut splats: Vec<([f64; 6], f64)> = projected
             .chunks_exact(9)

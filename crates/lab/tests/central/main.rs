@@ -1,4 +1,5 @@
-//! The gradient check of any function: what it finds, what it passes, and what PyTorch says of the same functions.
+//! The gradient check of any function: what it finds, what it passes, and what PyTorch says of the
+//! same functions.
 //!
 //! - `ten`: ten functions beside `torch.autograd.gradcheck`.
 //! - `planted`: bugs of every kind, found and named.

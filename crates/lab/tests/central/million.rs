@@ -63,8 +63,8 @@ fn one_wrong_element_is_found_wherever_it_is() {
     }
 }
 
-/// The limit that the report states: an element beyond it is found, and far below it is not. With `--nocapture` the numbers
-/// of docs/GRADCHECK.md.
+/// The limit that the report states: an element beyond it is found, and far below it is not. With
+/// `--nocapture` the numbers of docs/GRADCHECK.md.
 #[test]
 fn the_limit_is_where_the_report_says() {
     let x = input();
@@ -119,7 +119,8 @@ fn two_wrong_elements_are_both_found() {
     assert_eq!(found, [Some(vec![77]), Some(vec![888_888])], "{report}");
 }
 
-/// Functions that mix all elements, and outputs of one element: nothing about the search needs a function by elements.
+/// Functions that mix all elements, and outputs of one element: nothing about the search needs a
+/// function by elements.
 #[test]
 fn functions_that_mix_elements() {
     let x = || ("x", random(5, [1000, 1000]));
@@ -143,7 +144,8 @@ fn functions_that_mix_elements() {
     }
 }
 
-/// Thousands of elements have their kink within the largest step; one has it at the point, one is wrong.
+/// Thousands of elements have their kink within the largest step; one has it at the point, one is
+/// wrong.
 #[test]
 fn kinks_all_over() {
     let mut values = super::numbers(7, MILLION);

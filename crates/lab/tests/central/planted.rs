@@ -89,7 +89,8 @@ fn a_detached_input() {
     );
 }
 
-/// Behind a dead ReLU nothing tells a detached input from another. The report says that all is zero.
+/// Behind a dead ReLU nothing tells a detached input from another. The report says that all is
+/// zero.
 #[test]
 fn an_input_without_influence_is_named() {
     for elements in [0, 1000] {
@@ -227,7 +228,8 @@ fn a_bug_in_the_second_output() {
     assert!(!report.is_ok(), "{report}");
 }
 
-/// In a large input kinks are looked for one after the other. Ten are too many, and what they may hide is not passed.
+/// In a large input kinks are looked for one after the other. Ten are too many, and what they may
+/// hide is not passed.
 #[test]
 fn too_many_kinks_in_a_large_input() {
     let mut values = numbers(12, 2000);

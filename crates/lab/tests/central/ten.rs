@@ -1,4 +1,5 @@
-//! Ten functions, five of them with a planted bug, beside PyTorch: `generate.py` wrote what it says of them.
+//! Ten functions, five of them with a planted bug, beside PyTorch: `generate.py` wrote what it says
+//! of them.
 
 use std::path::Path;
 
@@ -111,7 +112,8 @@ fn verdicts_beside_pytorch() {
             kinds.windows(2).all(|two| same_kind(two[0], two[1])),
             "{report}"
         );
-        // Where we differ: its fast mode does not see the one element, and it takes the kink for a wrong gradient.
+        // Where we differ: its fast mode does not see the one element, and it takes the kink for a
+        // wrong gradient.
         let differ = matches!(*name, "one_in_a_million" | "kink");
         assert_eq!(passes == report.is_ok(), !differ, "{report}");
     }

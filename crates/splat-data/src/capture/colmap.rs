@@ -1,7 +1,8 @@
-//! COLMAP's sparse model, whatever its encoding: where it lies, what it holds, and whether that makes sense.
+//! COLMAP's sparse model, whatever its encoding: where it lies, what it holds, and whether that
+//! makes sense.
 //!
-//! Format: <https://colmap.github.io/format.html>. Files that are not needed here (`rigs.bin`, `frames.bin`,
-//! `project.ini`) are left alone.
+//! Format: <https://colmap.github.io/format.html>. Files that are not needed here (`rigs.bin`,
+//! `frames.bin`, `project.ini`) are left alone.
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -17,8 +18,8 @@ pub(super) const FORMAT: CaptureFormat = CaptureFormat {
     read,
 };
 
-/// Camera models in the order of COLMAP's numbers, with how many parameters each has. New numbers are only ever
-/// appended, so what is missing here is refused by its number.
+/// Camera models in the order of COLMAP's numbers, with how many parameters each has. New numbers
+/// are only ever appended, so what is missing here is refused by its number.
 const MODELS: [(&str, usize); 12] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -53,7 +54,8 @@ pub(super) fn pinhole_intrinsics(parameters: &[f64]) -> [f64; 4] {
     match *parameters {
         [f, cx, cy] => [f, f, cx, cy],
         [fx, fy, cx, cy] => [fx, fy, cx, cy],
-        // Both readers read exactly `pinhole_parameters` numbers; anything else fails the checks below.
+        // Both readers read exactly `pinhole_parameters` numbers; anything else fails the checks
+        // below.
         _ => [f64::NAN; 4],
     }
 }
@@ -173,8 +175,8 @@ struct ModelFiles {
 }
 
 impl ModelFiles {
-    /// The binary files if all are there, else the text files; otherwise names the missing one of the encoding that
-    /// has the cameras.
+    /// The binary files if all are there, else the text files; otherwise names the missing one of
+    /// the encoding that has the cameras.
     fn find(folder: &Path) -> Result<Self, CaptureError> {
         let [binary, text] = [true, false].map(|binary| Self::of(folder, binary));
         match (binary.missing(), text.missing()) {
@@ -318,7 +320,8 @@ fn check_image(
     Ok(())
 }
 
-/// Whether a name, in the notation of any system, is that of something in the folder that it is looked for in.
+/// Whether a name, in the notation of any system, is that of something in the folder that it is
+/// looked for in.
 fn stays_inside(name: &str) -> bool {
     let has_drive = matches!(name.as_bytes(), [drive, b':', ..] if drive.is_ascii_alphabetic());
     let from_root = has_drive || name.starts_with(['/', '\\']);

@@ -1,7 +1,7 @@
 //! COLMAP's binary files: little endian, packed, every list preceded by its length.
 //!
-//! Every length is checked against what is left of the file before anything is allocated for it, so a truncated or
-//! damaged file is an error and never a panic or a huge allocation.
+//! Every length is checked against what is left of the file before anything is allocated for it, so
+//! a truncated or damaged file is an error and never a panic or a huge allocation.
 
 use std::fmt::Display;
 use std::path::Path;
@@ -10,7 +10,8 @@ use super::colmap::{model_name, pinhole_intrinsics, pinhole_parameters};
 use super::sparse_model::{SparseCamera, SparseImage};
 use super::{CaptureError, Point};
 
-/// Bytes of a camera record up to its parameters, of the shortest image record and of the shortest point record.
+/// Bytes of a camera record up to its parameters, of the shortest image record and of the shortest
+/// point record.
 const MIN_CAMERA: usize = 4 + 4 + 8 + 8;
 const MIN_IMAGE: usize = 4 + 7 * 8 + 4 + 1 + 8;
 const MIN_POINT: usize = 8 + 3 * 8 + 3 + 8 + 8;

@@ -1,7 +1,8 @@
-//! COLMAP's text files: one record a line (two for an image), fields separated by blanks, `#` starts a comment line.
+//! COLMAP's text files: one record a line (two for an image), fields separated by blanks, `#`
+//! starts a comment line.
 //!
-//! Comments may be in any encoding; a record must be UTF-8, since a name in another is no file's name. What is read takes
-//! less than 32 times the memory of the file.
+//! Comments may be in any encoding; a record must be UTF-8, since a name in another is no file's
+//! name. What is read takes less than 32 times the memory of the file.
 
 use std::path::Path;
 use std::str::{FromStr, SplitAsciiWhitespace};
@@ -19,7 +20,8 @@ pub(super) struct Listed<T> {
 }
 
 impl<T> Listed<T> {
-    /// The records; a warning if they are not as many as announced. `what` they are is said in the plural.
+    /// The records; a warning if they are not as many as announced. `what` they are is said in the
+    /// plural.
     pub fn checked(
         self,
         path: &Path,
@@ -81,12 +83,14 @@ pub(super) fn parse_cameras(
     })
 }
 
-/// Parses `images.txt`: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, and then a line of keypoints, `X Y POINT3D_ID` any
-/// number of times, which is skipped. The name runs to the end of its line, blanks included. `path` is for messages.
+/// Parses `images.txt`: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, and then a line of
+/// keypoints, `X Y POINT3D_ID` any number of times, which is skipped. The name runs to the end of
+/// its line, blanks included. `path` is for messages.
 ///
-/// The line of keypoints may be empty, and programs leave it out where there are none. So each line is taken for what it
-/// can be: keypoints are numbers only, three by three, which an image with a name is not. A line that could be either (a
-/// name of nothing but numbers, or keypoints that count like ids) is keypoints if it follows an image.
+/// The line of keypoints may be empty, and programs leave it out where there are none. So each line
+/// is taken for what it can be: keypoints are numbers only, three by three, which an image with a
+/// name is not. A line that could be either (a name of nothing but numbers, or keypoints that count
+/// like ids) is keypoints if it follows an image.
 pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<SparseImage>, CaptureError> {
     /// What the last line with anything on it, and an empty one after it, leave open.
     #[derive(PartialEq)]
@@ -151,7 +155,8 @@ fn image(mut fields: Fields<'_>) -> Result<SparseImage, String> {
     })
 }
 
-/// Whether a line is numbers only, three by three. Where it might be an `image` too, every third must be whole, as ids are.
+/// Whether a line is numbers only, three by three. Where it might be an `image` too, every third
+/// must be whole, as ids are.
 fn are_keypoints(line: &str, image: bool) -> bool {
     let is_number = |field: &str| {
         // Cheaper than parsing, and as good where nothing else fits the line.
@@ -169,8 +174,8 @@ fn are_keypoints(line: &str, image: bool) -> bool {
     count % 3 == 0
 }
 
-/// Parses `points3D.txt`: `POINT3D_ID X Y Z R G B ERROR TRACK[]`; the track, pairs of an image id and a keypoint's index, is
-/// skipped, and may be left out with the error. `path` is for messages.
+/// Parses `points3D.txt`: `POINT3D_ID X Y Z R G B ERROR TRACK[]`; the track, pairs of an image id
+/// and a keypoint's index, is skipped, and may be left out with the error. `path` is for messages.
 pub(super) fn parse_points(path: &Path, text: &[u8]) -> Result<Listed<Point>, CaptureError> {
     let file = File::new(path, text)?;
     let point = |mut fields: Fields<'_>| {
@@ -246,7 +251,8 @@ impl<'a> File<'a> {
         self.lines().filter(is_record)
     }
 
-    /// The number in the first comment like `# Number of images: 15, mean observations per image: 812`.
+    /// The number in the first comment like `# Number of images: 15, mean observations per image:
+    /// 812`.
     fn announced(&self, what: &str) -> Option<u64> {
         let mut comments = lines(self.text).filter(|(_, line)| line.starts_with(b"#"));
         comments.find_map(|(_, line)| {

@@ -1,11 +1,12 @@
 //! Downscaling by a whole factor: the mean over blocks of `factor` x `factor` pixels.
 
-/// Area-averages an 8-bit RGB image of `width` x `height` pixels by `factor`, to `floor(width / factor)` x
-/// `floor(height / factor)`. What is left over at the right and bottom edge is dropped.
+/// Area-averages an 8-bit RGB image of `width` x `height` pixels by `factor`, to `floor(width /
+/// factor)` x `floor(height / factor)`. What is left over at the right and bottom edge is dropped.
 ///
-/// The average is over the 8-bit values as they are (no gamma), rounded to nearest; this is the usual resampling of
-/// the field, and what published scores at reduced size rest on. With pixel centres at + 0.5 the intrinsics of the
-/// result are the original ones divided by `factor`, see [`intrinsics`].
+/// The average is over the 8-bit values as they are (no gamma), rounded to nearest; this is the
+/// usual resampling of the field, and what published scores at reduced size rest on. With pixel
+/// centres at + 0.5 the intrinsics of the result are the original ones divided by `factor`, see
+/// [`intrinsics`].
 pub(super) fn area_average(
     image: &[u8],
     width: u32,

@@ -3,8 +3,8 @@
 use std::fmt;
 use std::path::PathBuf;
 
-/// Why a capture cannot be used. Every message is one line that names the file and the record, and says what to do
-/// where that is not plain.
+/// Why a capture cannot be used. Every message is one line that names the file and the record, and
+/// says what to do where that is not plain.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CaptureError {
@@ -158,7 +158,8 @@ pub enum CaptureError {
         path: PathBuf,
         /// Name of the image in the model.
         image: String,
-        /// Another folder of the capture, relative to it, that holds more photos of the model, and how many.
+        /// Another folder of the capture, relative to it, that holds more photos of the model, and
+        /// how many.
         elsewhere: Option<(PathBuf, usize)>,
     },
     /// A photo of which a part is missing, which decoders make up.
@@ -261,7 +262,8 @@ pub enum CaptureError {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum CaptureWarning {
-    /// Photos were rescaled without rewriting the cameras; the intrinsics were scaled to the photos.
+    /// Photos were rescaled without rewriting the cameras; the intrinsics were scaled to the
+    /// photos.
     RescaledPhotos {
         /// Number of such photos.
         count: usize,
@@ -290,7 +292,8 @@ pub enum CaptureWarning {
         /// The number of records.
         read: usize,
     },
-    /// JPEG files with more data than their picture takes, or less detail than they were begun with.
+    /// JPEG files with more data than their picture takes, or less detail than they were begun
+    /// with.
     DamagedPhotos {
         /// Number of such photos.
         count: usize,

@@ -19,7 +19,8 @@ pub(super) struct CaptureFormat {
 /// Every format; the first that fits is read.
 const FORMATS: &[CaptureFormat] = &[colmap::FORMAT];
 
-/// Reads the folder in the format that it holds. Where it holds none, the error is that of the first.
+/// Reads the folder in the format that it holds. Where it holds none, the error is that of the
+/// first.
 pub(super) fn read(root: &Path) -> ReadModel {
     let format = FORMATS.iter().find(|format| (format.is_in)(root));
     (format.unwrap_or(&FORMATS[0]).read)(root)

@@ -76,8 +76,8 @@ pub(super) fn check_memory(
         bytes([camera.width, camera.height])
     };
     let Some(left) = left else { return Ok(()) };
-    // Photos may have another size than their cameras; but to look at each takes time, and mostly there is far more memory
-    // than they take.
+    // Photos may have another size than their cameras; but to look at each takes time, and mostly
+    // there is far more memory than they take.
     const AMPLE: u64 = 64;
     let by_cameras = model.images.iter().map(of_camera);
     if by_cameras.fold(0, u64::saturating_add) <= left / AMPLE {
@@ -190,7 +190,8 @@ impl PhotoFile {
     }
 
     /// Refuses a photo of which a part is missing, where the decoder would not; whether the file
-    /// looks damaged all the same. (Of a PNG file every part has a checksum, which the decoder checks.)
+    /// looks damaged all the same. (Of a PNG file every part has a checksum, which the decoder
+    /// checks.)
     fn check_whole(&mut self, path: &Path) -> Result<bool, CaptureError> {
         if self.format != ImageFormat::Jpeg {
             return Ok(false);
@@ -225,10 +226,12 @@ fn undecodable(path: &Path, error: &ImageError) -> CaptureError {
     }
 }
 
-/// The camera's intrinsics for a photo of `size`, or nothing where the photo's shape is not the camera's.
+/// The camera's intrinsics for a photo of `size`, or nothing where the photo's shape is not the
+/// camera's.
 ///
-/// A rescale counts as uniform where one factor explains both sides to within a pixel (sizes are rounded). The sides
-/// are then scaled each by its own ratio, so that the photo's edges stay the camera's edges.
+/// A rescale counts as uniform where one factor explains both sides to within a pixel (sizes are
+/// rounded). The sides are then scaled each by its own ratio, so that the photo's edges stay the
+/// camera's edges.
 fn fit_intrinsics(camera: &SparseCamera, size: [u32; 2]) -> Option<[f64; 4]> {
     let [fx, fy, cx, cy] = camera.intrinsics;
     let [w, h] = size.map(f64::from);

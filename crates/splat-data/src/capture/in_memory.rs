@@ -1,5 +1,5 @@
-//! A capture of grey photos from the content of a model's files, for whoever has no folder: fuzz targets and the tests that
-//! come of them.
+//! A capture of grey photos from the content of a model's files, for whoever has no folder: fuzz
+//! targets and the tests that come of them.
 
 use std::path::PathBuf;
 use std::sync::Arc;

@@ -1,8 +1,9 @@
 //! Whether a JPEG file holds all of its picture.
 //!
-//! Decoders make up what is missing: where a file is cut off they paint grey, and where its data end early they go on with
-//! bits of value 0, without an error. So the coded data are walked here, block by block (ITU T.81), for nothing but their
-//! length. JPEG has no checksums: damage in the middle is noticed where it puts the data out of step, which is most often.
+//! Decoders make up what is missing: where a file is cut off they paint grey, and where its data
+//! end early they go on with bits of value 0, without an error. So the coded data are walked here,
+//! block by block (ITU T.81), for nothing but their length. JPEG has no checksums: damage in the
+//! middle is noticed where it puts the data out of step, which is most often.
 
 mod bits;
 mod scan;
@@ -12,15 +13,18 @@ use scan::{BLOCK, Component, Frame, Member, Scan, UNSENT, Unfinished};
 
 /// The two bytes that end a picture.
 pub(super) const END: [u8; 2] = [0xff, 0xd9];
-/// Scans of a picture that are walked at most: each costs time however short it is. Encoders make 10 or so.
+/// Scans of a picture that are walked at most: each costs time however short it is. Encoders make
+/// 10 or so.
 const MOST_SCANS: usize = 100;
 
 /// What a file that holds all of its picture has besides.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Whole {
-    /// The picture ends as it should, with [`END`]. Where it does not, all of it is there nevertheless.
+    /// The picture ends as it should, with [`END`]. Where it does not, all of it is there
+    /// nevertheless.
     pub ended: bool,
-    /// More picture data than the picture has, or an end before the scans with its detail: the file is likely damaged.
+    /// More picture data than the picture has, or an end before the scans with its detail: the file
+    /// is likely damaged.
     pub suspect: bool,
 }
 

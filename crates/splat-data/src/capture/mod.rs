@@ -1,11 +1,13 @@
 //! Captures: photos with their cameras and the points that structure from motion found.
 //!
-//! [`Capture::load`] reads a folder in COLMAP's layout, decodes every photo once and in parallel, and returns plain
-//! data: nothing here knows a tensor or prints a line. What is odd but usable comes back as
-//! [`Capture::warnings`]; what is not is a [`CaptureError`] that names the file, the record and what to do.
+//! [`Capture::load`] reads a folder in COLMAP's layout, decodes every photo once and in parallel,
+//! and returns plain data: nothing here knows a tensor or prints a line. What is odd but usable
+//! comes back as [`Capture::warnings`]; what is not is a [`CaptureError`] that names the file, the
+//! record and what to do.
 //!
-//! Conventions (those of the whole project): right-handed world; camera axes +x right, +y down, +z forward; the view
-//! matrix maps world to camera; the centre of pixel (i, j) lies at (i + 0.5, j + 0.5).
+//! Conventions (those of the whole project): right-handed world; camera axes +x right, +y down, +z
+//! forward; the view matrix maps world to camera; the centre of pixel (i, j) lies at (i + 0.5, j +
+//! 0.5).
 
 mod colmap;
 mod colmap_binary;
@@ -34,7 +36,8 @@ use crate::Camera;
 pub use error::{CaptureError, CaptureWarning};
 pub use split::Split;
 
-/// A photo capture, whole in memory: every photo with its camera, the sparse points, and which views are held out.
+/// A photo capture, whole in memory: every photo with its camera, the sparse points, and which
+/// views are held out.
 #[derive(Debug, Clone)]
 pub struct Capture {
     /// Name of the capture's folder.
@@ -62,11 +65,13 @@ pub struct View {
     pub width: u32,
     /// Height of `image` in pixels.
     pub height: u32,
-    /// `[fx, fy, cx, cy]` in pixels of `image`; the centre of pixel (i, j) is at (i + 0.5, j + 0.5).
+    /// `[fx, fy, cx, cy]` in pixels of `image`; the centre of pixel (i, j) is at (i + 0.5, j +
+    /// 0.5).
     pub intrinsics: [f64; 4],
     /// World to camera, row-major 4x4, last row `0 0 0 1`.
     pub viewmat: [[f64; 4]; 4],
-    /// 8-bit RGB, row by row from the top: `3 * width * height` bytes. Shared, so that a view is cheap to clone.
+    /// 8-bit RGB, row by row from the top: `3 * width * height` bytes. Shared, so that a view is
+    /// cheap to clone.
     pub image: Arc<Vec<u8>>,
 }
 
@@ -85,8 +90,8 @@ pub struct Point {
 pub struct CaptureOptions {
     /// Area-average every photo by this factor, at least 1 (1: as it is). Default 1.
     pub downscale: u32,
-    /// Folder of the photos, relative to the capture's or absolute. Default: `images`, or the capture's own folder where
-    /// there is no `images`.
+    /// Folder of the photos, relative to the capture's or absolute. Default: `images`, or the
+    /// capture's own folder where there is no `images`.
     pub images: Option<PathBuf>,
 }
 
@@ -109,19 +114,21 @@ impl Default for CaptureOptions {
 impl Capture {
     /// Reads the capture in the folder `root`.
     ///
-    /// The COLMAP model is looked for in `sparse/0`, then `sparse`, then `root` itself, binary before text; the
-    /// photos in [`CaptureOptions::images`]. Cameras must be `PINHOLE` or `SIMPLE_PINHOLE`. Photos are decoded in
-    /// parallel; where a photo's size is a uniform rescale of its camera's, the intrinsics follow the photo and a
-    /// warning says so. A photo of which a part is missing is refused. The held-out views are those `split.json`
-    /// names, or else every 8th by name from the first.
+    /// The COLMAP model is looked for in `sparse/0`, then `sparse`, then `root` itself, binary
+    /// before text; the photos in [`CaptureOptions::images`]. Cameras must be `PINHOLE` or
+    /// `SIMPLE_PINHOLE`. Photos are decoded in parallel; where a photo's size is a uniform rescale
+    /// of its camera's, the intrinsics follow the photo and a warning says so. A photo of which a
+    /// part is missing is refused. The held-out views are those `split.json` names, or else every
+    /// 8th by name from the first.
     ///
-    /// Reading the model takes less than 32 times the memory of its files, a JPEG file 64 times (while it is read);
-    /// the pixels of the photos come on top, three bytes each, and up to twelve while a photo is decoded.
+    /// Reading the model takes less than 32 times the memory of its files, a JPEG file 64 times
+    /// (while it is read); the pixels of the photos come on top, three bytes each, and up to twelve
+    /// while a photo is decoded.
     ///
     /// # Errors
     ///
-    /// Whatever makes the capture unusable, see [`CaptureError`]. A capture of a single photo is read: whether there
-    /// is anything to train on is for [`Capture::check_trainable`].
+    /// Whatever makes the capture unusable, see [`CaptureError`]. A capture of a single photo is
+    /// read: whether there is anything to train on is for [`Capture::check_trainable`].
     pub fn load(root: impl AsRef<Path>, options: &CaptureOptions) -> Result<Self, CaptureError> {
         let root = root.as_ref();
         if options.downscale == 0 {
@@ -203,8 +210,9 @@ impl View {
         }
     }
 
-    /// The view with its photo area-averaged by `factor`, as [`CaptureOptions::downscale`] has it, or by the largest power
-    /// of two below it that leaves both sides at least as long as SSIM's window.
+    /// The view with its photo area-averaged by `factor`, as [`CaptureOptions::downscale`] has it,
+    /// or by the largest power of two below it that leaves both sides at least as long as SSIM's
+    /// window.
     pub fn downscaled(&self, factor: u32) -> Self {
         let mut factor = factor;
         let shorter = self.width.min(self.height);
@@ -230,8 +238,8 @@ impl View {
         }
     }
 
-    /// Where a world point falls in the photo, `(x, y)` in pixels, and its depth along the camera's axis. Points at
-    /// depth 0 have no finite place.
+    /// Where a world point falls in the photo, `(x, y)` in pixels, and its depth along the camera's
+    /// axis. Points at depth 0 have no finite place.
     pub fn project(&self, point: [f64; 3]) -> ([f64; 2], f64) {
         let [x, y, z]: [f64; 3] = std::array::from_fn(|row| {
             let r = &self.viewmat[row];

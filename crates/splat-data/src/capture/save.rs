@@ -1,4 +1,5 @@
-//! Writes a capture into a folder as [`Capture::load`] and COLMAP read it: photos, a binary model, and the split.
+//! Writes a capture into a folder as [`Capture::load`] and COLMAP read it: photos, a binary model,
+//! and the split.
 
 use std::io::{Cursor, Error, ErrorKind};
 use std::path::Path;
@@ -13,14 +14,14 @@ use crate::write_atomically;
 const PINHOLE: i32 = 1;
 
 impl Capture {
-    /// Writes the capture to the folder `root`: `images/`, `sparse/0/*.bin` with a PINHOLE camera for every view, and
-    /// `split.json`. Photos are written as PNG, whatever their names end in. The model comes last, so that without it the
-    /// folder is not taken for whole.
+    /// Writes the capture to the folder `root`: `images/`, `sparse/0/*.bin` with a PINHOLE camera
+    /// for every view, and `split.json`. Photos are written as PNG, whatever their names end in.
+    /// The model comes last, so that without it the folder is not taken for whole.
     ///
     /// # Errors
     ///
-    /// [`CaptureError::Io`] if there is a model in `root` already, which may be all that is left of somebody's photos, if a
-    /// file cannot be written, or if a view's `image` is not of its size.
+    /// [`CaptureError::Io`] if there is a model in `root` already, which may be all that is left of
+    /// somebody's photos, if a file cannot be written, or if a view's `image` is not of its size.
     pub fn save(&self, root: &Path) -> Result<(), CaptureError> {
         let model = root.join("sparse");
         if model.exists() {

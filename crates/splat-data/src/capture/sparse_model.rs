@@ -4,8 +4,8 @@ use std::collections::HashMap;
 
 use super::Point;
 
-/// A sparse model as read and checked: every number finite, every image's camera present, at least one image and
-/// one point.
+/// A sparse model as read and checked: every number finite, every image's camera present, at least
+/// one image and one point.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct SparseModel {
     /// Cameras by id.

@@ -32,8 +32,8 @@ impl Split {
         Self { train, test }
     }
 
-    /// The split that `split.json` in `root` names, or the usual one where there is no such file. `names` are the
-    /// photos' names, sorted.
+    /// The split that `split.json` in `root` names, or the usual one where there is no such file.
+    /// `names` are the photos' names, sorted.
     pub(super) fn of_capture(
         root: &Path,
         names: &[&str],

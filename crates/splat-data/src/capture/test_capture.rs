@@ -1,5 +1,5 @@
-//! A small synthetic capture for the tests, written in COLMAP's binary or text encoding by code that knows nothing of
-//! the readers.
+//! A small synthetic capture for the tests, written in COLMAP's binary or text encoding by code
+//! that knows nothing of the readers.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -67,7 +67,8 @@ impl TestCapture {
         }
     }
 
-    /// Writes the binary model to `folder`. Every second image has keypoints, the first of them untracked.
+    /// Writes the binary model to `folder`. Every second image has keypoints, the first of them
+    /// untracked.
     pub fn write_binary(&self, folder: &Path) {
         std::fs::create_dir_all(folder).unwrap();
         std::fs::write(folder.join("cameras.bin"), self.cameras_bin()).unwrap();

@@ -1,5 +1,5 @@
-//! What the readers promise: both encodings are one model, the geometry is kept, and bad input is an error that names
-//! the file, never a panic.
+//! What the readers promise: both encodings are one model, the geometry is kept, and bad input is
+//! an error that names the file, never a panic.
 
 use std::path::{Path, PathBuf};
 

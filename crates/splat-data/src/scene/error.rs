@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-/// Why a scene file cannot be read or written. Every message is one line that names the file, the property and the
-/// Gaussian (counted from 0).
+/// Why a scene file cannot be read or written. Every message is one line that names the file, the
+/// property and the Gaussian (counted from 0).
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum SceneFileError {
@@ -68,8 +68,8 @@ pub enum SceneFileError {
         /// What is wrong with it.
         reason: String,
     },
-    /// A value that is NaN, or infinite where that means nothing: opacity logits may be infinite, log-scales minus
-    /// infinite.
+    /// A value that is NaN, or infinite where that means nothing: opacity logits may be infinite,
+    /// log-scales minus infinite.
     #[error("{}: Gaussian {index}: {property} is {value}", path.display())]
     NotFinite {
         /// The file.

@@ -12,7 +12,8 @@ pub struct SceneFormat {
     pub name: &'static str,
     /// Endings of its files, without the dot, in lower case.
     pub endings: &'static [&'static str],
-    /// Whether a file begins as one in this format does, given its first 64 bytes or all of a shorter one.
+    /// Whether a file begins as one in this format does, given its first 64 bytes or all of a
+    /// shorter one.
     pub is: fn(&[u8]) -> bool,
     /// Reads a file.
     pub read: fn(&Path) -> Result<SplatData, SceneFileError>,
@@ -26,7 +27,8 @@ pub const FORMATS: &[SceneFormat] = &[ply::FORMAT];
 /// Bytes from which a format is known.
 const HEAD: u64 = 64;
 
-/// Reads a scene in any format: the one that the file's first bytes are of, or else that of its name, or else the first.
+/// Reads a scene in any format: the one that the file's first bytes are of, or else that of its
+/// name, or else the first.
 ///
 /// # Errors
 /// When the file cannot be read or is not in the format, see [`SceneFileError`].

@@ -1,7 +1,7 @@
 //! Scene files: trained splats in and out, as plain data ([`SplatData`]) that knows no tensor.
 //!
-//! [`read()`] and [`write()`] know the format by the file. Today there is one: [`ply`], the layout of the 3DGS paper's
-//! code, which every viewer reads.
+//! [`read()`] and [`write()`] know the format by the file. Today there is one: [`ply`], the layout
+//! of the 3DGS paper's code, which every viewer reads.
 
 pub mod ply;
 
@@ -13,11 +13,12 @@ pub use formats::{FORMATS, SceneFormat, read, write};
 
 use crate::SceneScale;
 
-/// A scene as files hold it: plain arrays, one entry per Gaussian, in the parametrisation that is trained.
+/// A scene as files hold it: plain arrays, one entry per Gaussian, in the parametrisation that is
+/// trained.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SplatData {
-    /// Where in the world the means count from: 0 unless the scene lies far from the world's zero, as in map
-    /// coordinates, where 32-bit floats would round its details away.
+    /// Where in the world the means count from: 0 unless the scene lies far from the world's zero,
+    /// as in map coordinates, where 32-bit floats would round its details away.
     pub origin: [f64; 3],
     /// Centres relative to `origin`, `[N][3]`, world units.
     pub means: Vec<[f32; 3]>,
@@ -29,8 +30,8 @@ pub struct SplatData {
     pub opacity_logits: Vec<f32>,
     /// Coefficient of the constant spherical harmonic, `[N][3]` (RGB).
     pub sh0: Vec<[f32; 3]>,
-    /// Remaining coefficients, `[N][K - 1][3]` flattened with `K = (sh_degree + 1)^2`: for each Gaussian its
-    /// coefficients in order, each with its three channels.
+    /// Remaining coefficients, `[N][K - 1][3]` flattened with `K = (sh_degree + 1)^2`: for each
+    /// Gaussian its coefficients in order, each with its three channels.
     pub sh_rest: Vec<f32>,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: usize,
@@ -38,8 +39,8 @@ pub struct SplatData {
     pub settings: SceneSettings,
 }
 
-/// Settings that a scene must be rendered with to look as it did when it was trained. They are part of the scene, and
-/// of its file: `None` where the file does not say.
+/// Settings that a scene must be rendered with to look as it did when it was trained. They are part
+/// of the scene, and of its file: `None` where the file does not say.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SceneSettings {
     /// Size of the scene in world units, which lengths of the renderer count in; positive.
@@ -48,8 +49,8 @@ pub struct SceneSettings {
     pub antialias: Option<bool>,
     /// Colour behind the scene, linear RGB; black is zero.
     pub background: Option<[f32; 3]>,
-    /// What the file says about rendering that this program cannot follow, each in a line; for a warning, and not
-    /// written.
+    /// What the file says about rendering that this program cannot follow, each in a line; for a
+    /// warning, and not written.
     pub not_understood: Vec<String>,
 }
 

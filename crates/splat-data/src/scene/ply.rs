@@ -6,16 +6,17 @@
 //! x y z  nx ny nz  f_dc_0..2  f_rest_0..(3 (K - 1) - 1)  opacity  scale_0..2  rot_0..3
 //! ```
 //!
-//! where K = (degree + 1)^2, opacity is the logit, scale the natural logarithm, rot the quaternion (w, x, y, z), and
-//! `f_rest_*` runs over the coefficients of red, then of green, then of blue (channel-major; in [`SplatData`] it is
-//! coefficient-major). The normals are written as 0 and not read.
+//! where K = (degree + 1)^2, opacity is the logit, scale the natural logarithm, rot the quaternion
+//! (w, x, y, z), and `f_rest_*` runs over the coefficients of red, then of green, then of blue
+//! (channel-major; in [`SplatData`] it is coefficient-major). The normals are written as 0 and not
+//! read.
 //!
-//! Comments of the header hold the origin and how to render the scene ([`SplatData::settings`]): `ply/comments.rs` has
-//! their form. Other programs see a scene without the offset of its origin.
+//! Comments of the header hold the origin and how to render the scene ([`SplatData::settings`]):
+//! `ply/comments.rs` has their form. Other programs see a scene without the offset of its origin.
 //!
-//! [`write()`] writes binary little endian. [`read()`] also takes ASCII and big endian, properties in any order and of any
-//! number type (such as `double`), ignores properties and elements it does not know, and is generous with the header:
-//! `ply/header.rs` has how.
+//! [`write()`] writes binary little endian. [`read()`] also takes ASCII and big endian, properties
+//! in any order and of any number type (such as `double`), ignores properties and elements it does
+//! not know, and is generous with the header: `ply/header.rs` has how.
 
 mod columns;
 mod comments;
@@ -46,14 +47,15 @@ pub(super) const FORMAT: SceneFormat = SceneFormat {
     write: |path, scene| write(path, scene),
 };
 
-/// Writes `scene` to `path`, whole or not at all: beside it first, then renamed. The disk has the new file before it
-/// loses the old one, so that a crash of the machine leaves one of them.
+/// Writes `scene` to `path`, whole or not at all: beside it first, then renamed. The disk has the
+/// new file before it loses the old one, so that a crash of the machine leaves one of them.
 ///
 /// # Errors
 ///
-/// [`SceneFileError::Shape`] where the arrays of the scene do not fit each other, [`SceneFileError::NotFinite`] and
-/// [`SceneFileError::Setting`] where a value means nothing and no reader would take it (NaN, or infinite where that means
-/// nothing), [`SceneFileError::Io`] where the file cannot be written.
+/// [`SceneFileError::Shape`] where the arrays of the scene do not fit each other,
+/// [`SceneFileError::NotFinite`] and [`SceneFileError::Setting`] where a value means nothing and no
+/// reader would take it (NaN, or infinite where that means nothing), [`SceneFileError::Io`] where
+/// the file cannot be written.
 pub fn write(path: impl AsRef<Path>, scene: &SplatData) -> Result<(), SceneFileError> {
     let path = path.as_ref();
     scene.check_shape()?;
@@ -204,8 +206,9 @@ fn property_names(rest: usize) -> Vec<String> {
 
 /// The values of one element in the order of the header.
 ///
-/// The PLY library hands values over and asks for them by name, once each and in the order of the header; keeping the
-/// order and not looking at the names makes a million Gaussians of 62 properties cheap.
+/// The PLY library hands values over and asks for them by name, once each and in the order of the
+/// header; keeping the order and not looking at the names makes a million Gaussians of 62
+/// properties cheap.
 struct Row {
     values: Vec<f32>,
     /// Next value to be written.
@@ -241,7 +244,8 @@ impl PropertyAccess for Row {
     }
 
     fn set_property(&mut self, _name: &str, property: Property) -> PropertyAccessResult {
-        // A list keeps its place in the order; `Columns::find` refuses lists where a number is needed.
+        // A list keeps its place in the order; `Columns::find` refuses lists where a number is
+        // needed.
         self.values
             .push(property.to_f32_lossy().unwrap_or(f32::NAN));
         PropertyAccessResult::Set
@@ -270,7 +274,8 @@ struct Rows<'a> {
 impl Rows<'_> {
     /// Passes over all of them.
     fn skip(&mut self, reader: &mut impl BufRead) -> Result<(), SceneFileError> {
-        // Of an element without properties a binary file holds nothing, however many the header announces.
+        // Of an element without properties a binary file holds nothing, however many the header
+        // announces.
         let nothing = self.element.properties.is_empty() && self.encoding != Encoding::Ascii;
         for index in 0..if nothing { 0 } else { self.element.count } {
             self.next(reader, index)?;
@@ -310,8 +315,8 @@ impl Rows<'_> {
             .map_err(|(property, reason)| self.bad(index, &format!("{property} {reason}")))
     }
 
-    /// The line's values, or a property and what is wrong with it. The library's own grammar of lines knows neither
-    /// NaN nor infinity, and it is worth naming the property that has them.
+    /// The line's values, or a property and what is wrong with it. The library's own grammar of
+    /// lines knows neither NaN nor infinity, and it is worth naming the property that has them.
     fn parse_line(&self) -> Result<Row, (&str, String)> {
         let mut words = self.line.split_whitespace();
         let mut row = Row::new();

@@ -11,8 +11,8 @@ use crate::optimizer::MomentEdit;
 use crate::rows::{FieldChanges, Moments, RowEdit};
 
 impl<M: Module> Optimized<M> {
-    /// Edits the rows of every field of a row set, and the moments with them: a gather per field on the device.
-    /// Parameters keep their ids.
+    /// Edits the rows of every field of a row set, and the moments with them: a gather per field on
+    /// the device. Parameters keep their ids.
     ///
     /// # Errors
     /// When the edit names an old row or a field that there is not, or values of another width.

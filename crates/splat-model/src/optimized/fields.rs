@@ -93,8 +93,8 @@ impl VisitField for GradientsOf<'_> {
     }
 }
 
-/// Maps the values of fields outside of the autodiff graph. While one is changed nothing else holds it, so that an
-/// optimiser can write into its memory.
+/// Maps the values of fields outside of the autodiff graph. While one is changed nothing else holds
+/// it, so that an optimiser can write into its memory.
 pub(super) fn change<M: Module>(
     model: &mut Option<M>,
     names: HashMap<String, String>,

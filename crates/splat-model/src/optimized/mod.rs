@@ -18,7 +18,8 @@ use crate::optimizer::{FieldOptimizer, MomentEdit, SplatAdam};
 use crate::{LearningRates, SplatModel};
 use fields::{FieldVisitor, GradientsOf, Paths, ValuesOf, change};
 
-/// Gradients by the name of the field, each `[N, width]`: what is beyond the first dimension is flattened.
+/// Gradients by the name of the field, each `[N, width]`: what is beyond the first dimension is
+/// flattened.
 pub type FieldGradients = BTreeMap<String, Tensor<2>>;
 
 /// What the optimiser does with a field in a step.
@@ -87,8 +88,8 @@ impl<M: Module> Optimized<M> {
         })
     }
 
-    /// A module whose float parameters are all trained with one learning rate, and have no row per Gaussian: what rides
-    /// along with a model.
+    /// A module whose float parameters are all trained with one learning rate, and have no row per
+    /// Gaussian: what rides along with a model.
     ///
     /// # Errors
     /// As those of [`new`](Self::new).
@@ -288,7 +289,8 @@ impl<M: Module> Optimized<M> {
     /// Replaces the value `[N, width]` of a field by another of its shape, and leaves its moments.
     ///
     /// # Errors
-    /// When the model has no such field, or the new value another shape; the field is then as it was.
+    /// When the model has no such field, or the new value another shape; the field is then as it
+    /// was.
     pub fn update(
         &mut self,
         field: &str,
@@ -315,8 +317,8 @@ impl<M: Module> Optimized<M> {
         self.waiting.remove(field);
     }
 
-    /// Lowers every opacity to at most `opacity` and lets the moments of the logits start anew (the opacity reset of 3DGS
-    /// section 5.2).
+    /// Lowers every opacity to at most `opacity` and lets the moments of the logits start anew (the
+    /// opacity reset of 3DGS section 5.2).
     ///
     /// # Errors
     /// When the model has no opacity logits.

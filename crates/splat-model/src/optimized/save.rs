@@ -14,8 +14,8 @@ use crate::optimizer::StateRecord;
 const WAITING: &str = "waiting_gradient";
 
 impl<M: Module> Optimized<M> {
-    /// Values and optimiser states of all fields, on the host: value `means` is tensor `means`, a moment of it
-    /// `means.moment_1`. Values are `[N, width]`.
+    /// Values and optimiser states of all fields, on the host: value `means` is tensor `means`, a
+    /// moment of it `means.moment_1`. Values are `[N, width]`.
     ///
     /// # Errors
     /// When the device fails.
@@ -50,11 +50,12 @@ impl<M: Module> Optimized<M> {
         Ok(record)
     }
 
-    /// Puts back what [`save`](Self::save) gave, with any number of rows. Parameters keep their ids.
+    /// Puts back what [`save`](Self::save) gave, with any number of rows. Parameters keep their
+    /// ids.
     ///
     /// # Errors
-    /// What does not fit the model or its optimisers, naming the field; nothing is changed then but the state of
-    /// optimisers.
+    /// What does not fit the model or its optimisers, naming the field; nothing is changed then but
+    /// the state of optimisers.
     pub fn restore(&mut self, record: StateRecord, device: &Device) -> Result<(), String> {
         let mut fields = record.by_field();
         let shapes = self.shapes();

@@ -10,8 +10,9 @@ use crate::Field;
 
 /// Adam for one field of the Gaussians.
 ///
-/// A gradient whose square is not finite counts as zero, element by element: as if the view had not seen that
-/// Gaussian. Once in the moments it would stay there and make the parameter NaN, or stop it for good.
+/// A gradient whose square is not finite counts as zero, element by element: as if the view had not
+/// seen that Gaussian. Once in the moments it would stay there and make the parameter NaN, or stop
+/// it for good.
 #[derive(Debug, Clone)]
 pub struct SplatAdam {
     /// Decay of the first moment.
@@ -20,7 +21,8 @@ pub struct SplatAdam {
     pub beta_2: f64,
     /// Added to the root of the second moment.
     pub epsilon: f64,
-    /// Which rows take a step. [`AdamRows::Seen`] is another optimiser with other results: measure before relying on it.
+    /// Which rows take a step. [`AdamRows::Seen`] is another optimiser with other results: measure
+    /// before relying on it.
     pub rows: AdamRows,
 }
 
@@ -41,8 +43,8 @@ impl SplatAdam {
         }
     }
 
-    /// The settings for a field, stepping `rows`: where its values are lengths, epsilon, one over a length, follows the
-    /// size of the scene.
+    /// The settings for a field, stepping `rows`: where its values are lengths, epsilon, one over a
+    /// length, follows the size of the scene.
     pub fn of_field(field: &Field, rows: AdamRows, scene: SceneScale) -> Self {
         let mut adam = Self::new();
         adam.rows = rows;
@@ -170,7 +172,8 @@ mod tests {
         }
     }
 
-    /// Rows that a step has not seen are as if it had not been, but for the count of steps; the others are as ever.
+    /// Rows that a step has not seen are as if it had not been, but for the count of steps; the
+    /// others are as ever.
     #[test]
     fn of_seen_rows_only_the_others_keep_everything() {
         let device = Device::flex();

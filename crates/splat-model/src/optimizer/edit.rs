@@ -32,13 +32,14 @@ impl MomentEdit {
     }
 }
 
-/// A Burn optimiser whose state can follow edits of rows. [`ThroughHost`](super::ThroughHost) makes one of any other.
+/// A Burn optimiser whose state can follow edits of rows. [`ThroughHost`](super::ThroughHost) makes
+/// one of any other.
 pub trait RowOptimizer: Optimizer {
     /// The state of a parameter `[N, width]` after an edit of its rows.
     fn edit_rows(state: Self::State<2>, edit: &MomentEdit) -> Self::State<2>;
 
-    /// Checks a saved state of a parameter of this shape before it is put together. Here every tensor must have the
-    /// parameter's shape.
+    /// Checks a saved state of a parameter of this shape before it is put together. Here every
+    /// tensor must have the parameter's shape.
     ///
     /// # Errors
     /// What does not fit, in a line.

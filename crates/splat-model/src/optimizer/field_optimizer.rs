@@ -18,7 +18,8 @@ pub struct StateRecord {
 }
 
 impl StateRecord {
-    /// The entries of each name before the first dot: the tensor of that name alone, and what is under it.
+    /// The entries of each name before the first dot: the tensor of that name alone, and what is
+    /// under it.
     pub(crate) fn by_field(self) -> BTreeMap<String, (Option<TensorData>, StateRecord)> {
         let mut fields: BTreeMap<String, (Option<TensorData>, Self)> = BTreeMap::new();
         for (name, data) in self.tensors {
@@ -38,7 +39,8 @@ impl StateRecord {
         fields
     }
 
-    /// Takes out everything under a name, which is cut from it: `model.means` under `model` is `means`.
+    /// Takes out everything under a name, which is cut from it: `model.means` under `model` is
+    /// `means`.
     pub fn take_under(&mut self, name: &str) -> Self {
         let is_under = |key: &str| {
             key.strip_prefix(name)
@@ -65,7 +67,8 @@ impl StateRecord {
         under
     }
 
-    /// Puts everything of another record under a name, which [`take_under`](Self::take_under) takes out again.
+    /// Puts everything of another record under a name, which [`take_under`](Self::take_under) takes
+    /// out again.
     pub fn put_under(&mut self, name: &str, other: Self) {
         let under = |key: String| format!("{name}.{key}");
         self.tensors.extend(

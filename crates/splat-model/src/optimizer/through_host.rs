@@ -6,10 +6,11 @@ use burn::tensor::{Device, Tensor, TensorData};
 use super::edit::{MomentEdit, RowOptimizer};
 use super::field_optimizer::StateRecord;
 
-/// Makes a [`RowOptimizer`] of any Burn optimiser: on an edit its state is read back, and every tensor with one row per
-/// row of the parameter is edited and sent to the device again. That is twice the size of the state per edit, with a wait
-/// for the device; for one edit in a hundred steps about 1 % of what the steps themselves move. A state that cannot be put
-/// together again starts anew.
+/// Makes a [`RowOptimizer`] of any Burn optimiser: on an edit its state is read back, and every
+/// tensor with one row per row of the parameter is edited and sent to the device again. That is
+/// twice the size of the state per edit, with a wait for the device; for one edit in a hundred
+/// steps about 1 % of what the steps themselves move. A state that cannot be put together again
+/// starts anew.
 #[derive(Debug, Clone)]
 pub struct ThroughHost<O>(pub O);
 

@@ -23,8 +23,8 @@ use crate::{Optimized, SplatModel};
 #[serde(default, deny_unknown_fields)]
 #[setters(prefix = "with_", strip_option)]
 pub struct AdcSettings {
-    /// Rows may be added after this step, or after a quarter of the run where that is sooner: before,
-    /// gradients are those of a scene that has not formed yet. Default 500.
+    /// Rows may be added after this step, or after a quarter of the run where that is sooner:
+    /// before, gradients are those of a scene that has not formed yet. Default 500.
     pub start: usize,
     /// Milestone: no rows are added or removed after this step. Default 15,000.
     pub stop: usize,
@@ -41,9 +41,9 @@ pub struct AdcSettings {
     pub prune_opacity: f64,
     /// Above this share of the scene's scale a Gaussian is removed. Default 0.1.
     pub prune_scale: f64,
-    /// Large Gaussians are removed only after this step, that of the first reset of opacities in 3DGS. Like the interval
-    /// of resets it does not shrink with the run: what is far away starts large and needs its time to split. Default
-    /// 3,000.
+    /// Large Gaussians are removed only after this step, that of the first reset of opacities in
+    /// 3DGS. Like the interval of resets it does not shrink with the run: what is far away starts
+    /// large and needs its time to split. Default 3,000.
     pub prune_scale_start: usize,
     /// Opacity that a reset leaves. Default 0.01.
     pub reset_opacity: f64,
@@ -104,8 +104,8 @@ impl Splats {
     }
 }
 
-/// The strategy of 3DGS: Gaussians whose screen gradients are large are cloned or split, faint and large ones removed, and
-/// opacities reset now and then.
+/// The strategy of 3DGS: Gaussians whose screen gradients are large are cloned or split, faint and
+/// large ones removed, and opacities reset now and then.
 #[derive(Debug, Clone)]
 pub struct Adc {
     settings: AdcSettings,
@@ -390,7 +390,8 @@ mod tests {
                 .iter()
                 .all(|x| (f64::from(*x) + 1.6f64.ln()).abs() < 1e-6)
         );
-        // The halves lie within a few standard deviations, not in one place, and the same next time.
+        // The halves lie within a few standard deviations, not in one place, and the same next
+        // time.
         let halves = [3, 4].map(|row| plan.offset_of(row, "means").unwrap());
         assert_ne!(halves[0], halves[1]);
         assert!(

@@ -1,8 +1,9 @@
 //! Strategies: which Gaussians a scene needs, and what else may change while it is trained.
 //!
-//! A [`Strategy`] is given to the trainer and called around every step of the optimiser. It sees gradients, parameters and
-//! rows, and may edit rows ([`RowEdit`](crate::RowEdit)), add terms to the loss, pause and scale the steps of fields, set the
-//! first Gaussians and the size of the photos, and render other training views. [`Adc`] is that of 3DGS.
+//! A [`Strategy`] is given to the trainer and called around every step of the optimiser. It sees
+//! gradients, parameters and rows, and may edit rows ([`RowEdit`](crate::RowEdit)), add terms to
+//! the loss, pause and scale the steps of fields, set the first Gaussians and the size of the
+//! photos, and render other training views. [`Adc`] is that of 3DGS.
 
 mod adc;
 mod relocation;
@@ -67,7 +68,8 @@ pub struct Pass<'a, M> {
 
 /// What a strategy may see and change around a step of the optimiser.
 pub struct StepContext<'a, M> {
-    /// How many steps are done: before the optimiser, those before this step; after it, this one too.
+    /// How many steps are done: before the optimiser, those before this step; after it, this one
+    /// too.
     pub at: StepInfo,
     /// The model and its optimisers; rows are edited here.
     pub model: &'a mut Optimized<M>,
@@ -136,7 +138,8 @@ pub struct Refinement {
 /// }
 /// ```
 pub trait Strategy<M: SplatModel>: Send {
-    /// What a checkpoint calls it: a run goes on with the strategy that it was begun with. Default: the type's name.
+    /// What a checkpoint calls it: a run goes on with the strategy that it was begun with. Default:
+    /// the type's name.
     fn name(&self) -> String {
         core::any::type_name::<Self>().to_owned()
     }
@@ -182,8 +185,8 @@ pub trait Strategy<M: SplatModel>: Send {
         Ok(())
     }
 
-    /// Called after the optimiser, but for the last step of a run: what it would add would never be trained. Returns what
-    /// was done where it was time to do something.
+    /// Called after the optimiser, but for the last step of a run: what it would add would never be
+    /// trained. Returns what was done where it was time to do something.
     ///
     /// # Errors
     /// As those of the ops that it uses.

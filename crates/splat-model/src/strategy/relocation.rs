@@ -1,18 +1,20 @@
-//! Splitting a Gaussian into copies that together look like it (Kheradmand et al. 2024, *3D Gaussian Splatting as
-//! Markov Chain Monte Carlo*, section 3.3 and eq. 9).
+//! Splitting a Gaussian into copies that together look like it (Kheradmand et al. 2024, *3D
+//! Gaussian Splatting as Markov Chain Monte Carlo*, section 3.3 and eq. 9).
 
 use core::f64::consts::PI;
 
-/// Opacity of each of `copies` Gaussians in one place that replace one of `opacity`, and the factor of their scales.
+/// Opacity of each of `copies` Gaussians in one place that replace one of `opacity`, and the factor
+/// of their scales.
 ///
 /// ```text
 /// o' = 1 - (1 - o)^(1/N)
 /// s' = s o / Σ_{i=1..N} Σ_{k=0..i-1} C(i-1, k) (-1)^k o'^(k+1) / √(k+1)
 /// ```
 ///
-/// The alternating sum loses every digit from N of about 40 on. It is the integral of a function that is never
-/// negative, `∫ 1 - (1 - o' exp(-x²))^N dx / √π`, and is taken as that; the trapezoidal rule on it converges
-/// geometrically. Opacities outside [0, 1] are clamped; no copies at all count as one.
+/// The alternating sum loses every digit from N of about 40 on. It is the integral of a function
+/// that is never negative, `∫ 1 - (1 - o' exp(-x²))^N dx / √π`, and is taken as that; the
+/// trapezoidal rule on it converges geometrically. Opacities outside [0, 1] are clamped; no copies
+/// at all count as one.
 pub fn relocate(opacity: f64, copies: usize) -> (f64, f64) {
     let opacity = opacity.clamp(0.0, 1.0);
     let n = copies.max(1) as f64;

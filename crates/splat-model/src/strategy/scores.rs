@@ -5,9 +5,10 @@ use splat_ops::{OpError, rasterize};
 
 use crate::{CameraTensors, RenderSettings, SplatModel, project_gaussians};
 
-/// The sum over pixels of weight times what each Gaussian contributes there, `Σ_p w_i(p) E(p)`, `[N]`: `w_i` is the share of
-/// Gaussian i in the pixel (alpha times transmittance), `E` any weight per pixel, `[C, H, W, 1]`, such as an error or an
-/// edge. It is the gradient of a render of one channel, so it costs a forward and a backward pass.
+/// The sum over pixels of weight times what each Gaussian contributes there, `Σ_p w_i(p) E(p)`,
+/// `[N]`: `w_i` is the share of Gaussian i in the pixel (alpha times transmittance), `E` any weight
+/// per pixel, `[C, H, W, 1]`, such as an error or an edge. It is the gradient of a render of one
+/// channel, so it costs a forward and a backward pass.
 ///
 /// # Errors
 /// When shapes do not fit.

@@ -1,8 +1,9 @@
-//! The ops on Burn's autodiff backend: one file per op says what is saved and how the gradient flows.
+//! The ops on Burn's autodiff backend: one file per op says what is saved and how the gradient
+//! flows.
 //!
-//! A tracked op has N parents and one output; only gradients of tracked parents are asked of the backend. Every gradient
-//! runs in a `tracing` span of its op's name, level trace, on the caller's thread: one load and a branch where nobody
-//! listens.
+//! A tracked op has N parents and one output; only gradients of tracked parents are asked of the
+//! backend. Every gradient runs in a `tracing` span of its op's name, level trace, on the caller's
+//! thread: one load and a branch where nobody listens.
 
 mod activation;
 mod adam;

@@ -1,5 +1,5 @@
-//! `rasterize`: saves its inputs and the backend's lists of splats per tile. With a background it has four parents,
-//! without one three.
+//! `rasterize`: saves its inputs and the backend's lists of splats per tile. With a background it
+//! has four parents, without one three.
 
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};

@@ -1,5 +1,5 @@
-//! Ops composed of Burn's tensor ops, for backends that have nothing of their own, and for what their own do not cover:
-//! other types than f32, windows too long for a workgroup's memory.
+//! Ops composed of Burn's tensor ops, for backends that have nothing of their own, and for what
+//! their own do not cover: other types than f32, windows too long for a workgroup's memory.
 
 mod activation;
 mod photometric;

@@ -88,7 +88,8 @@ mod tests {
                 .sum()
         });
         assert_eq!(sum, (0..1000usize).map(|i| i.div_ceil(2)).sum::<usize>());
-        // A busy machine may stop a thread for longer than it looks, and asking is work too: ask again, less often.
+        // A busy machine may stop a thread for longer than it looks, and asking is work too: ask
+        // again, less often.
         assert!((0..1000).any(|_| {
             thread::sleep(10 * PATIENCE);
             pool.broadcast(|_| LOOKS.get()) == [false; 3]

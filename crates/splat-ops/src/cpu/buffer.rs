@@ -16,7 +16,8 @@ pub(super) fn overwritten<T: Overwritten + bytemuck::Pod>(len: usize) -> Vec<T> 
     zeros(len)
 }
 
-/// Zeros, written by all threads where they are many: a step asks for more than one thread clears in the meantime.
+/// Zeros, written by all threads where they are many: a step asks for more than one thread clears
+/// in the meantime.
 pub(super) fn zeros<T: Overwritten + bytemuck::Pod>(len: usize) -> Vec<T> {
     const BLOCK: usize = 1024;
     if len < 64 * BLOCK {
@@ -77,7 +78,8 @@ impl Buffer {
     }
 }
 
-/// A tensor to be overwritten: in its own memory where nothing else holds that, in a copy otherwise.
+/// A tensor to be overwritten: in its own memory where nothing else holds that, in a copy
+/// otherwise.
 pub(super) struct BufferMut {
     tensor: FlexTensor,
 }

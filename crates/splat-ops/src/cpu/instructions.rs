@@ -8,7 +8,8 @@ use macerator::Arch;
 /// A set of instructions that the loops are compiled for; a better one is greater.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum InstructionSet {
-    /// The instructions of every processor of the target; the rasteriser uses SSE 4.2 where there is that.
+    /// The instructions of every processor of the target; the rasteriser uses SSE 4.2 where there
+    /// is that.
     Baseline,
     /// 64-bit Arm, whose baseline has them.
     Neon,
@@ -37,8 +38,8 @@ impl InstructionSet {
         Self::of(registers())
     }
 
-    /// Does something with a set, or the best one that is no better, in place of the best one: to measure and to compare.
-    /// Holds for the whole process, until this returns.
+    /// Does something with a set, or the best one that is no better, in place of the best one: to
+    /// measure and to compare. Holds for the whole process, until this returns.
     pub fn at_most<R>(self, run: impl FnOnce() -> R) -> R {
         struct Restored(u8);
         impl Drop for Restored {

@@ -1,8 +1,8 @@
 //! Which splats touch which tiles, in depth order (3DGS section 6).
 //!
-//! The splats that a camera sees are numbered in the order of their Gaussians, so that memory is read and written one
-//! after the other. Each emits its tiles; a counting sort brings these together tile by tile, and each tile sorts its own
-//! few by (depth, index).
+//! The splats that a camera sees are numbered in the order of their Gaussians, so that memory is
+//! read and written one after the other. Each emits its tiles; a counting sort brings these
+//! together tile by tile, and each tile sorts its own few by (depth, index).
 
 mod by_tile;
 mod emit;
@@ -29,7 +29,8 @@ const SEARCHED: usize = 2048;
 /// Intersections of one camera that can be listed: they are counted in 32 bits.
 const MAX_INTERSECTIONS: u64 = u32::MAX as u64;
 
-/// The one place that decides how many intersections are too many. Asked before any list is allocated.
+/// The one place that decides how many intersections are too many. Asked before any list is
+/// allocated.
 fn check_intersections(intersections: u64, limit: u64) -> Result<(), OpError> {
     if intersections <= limit {
         return Ok(());
@@ -41,7 +42,8 @@ fn check_intersections(intersections: u64, limit: u64) -> Result<(), OpError> {
     })
 }
 
-/// Refuses intersections that memory could not hold: the allocation that failed would end the process.
+/// Refuses intersections that memory could not hold: the allocation that failed would end the
+/// process.
 fn check_memory(intersections: u64, bytes_per_intersection: u64) -> Result<(), OpError> {
     let needed = intersections.saturating_mul(bytes_per_intersection);
     match lacking(needed) {
@@ -55,9 +57,11 @@ fn check_memory(intersections: u64, bytes_per_intersection: u64) -> Result<(), O
     }
 }
 
-/// Bytes that an intersection takes at most at any one time: while the lists are made, or then with the bytes `kept` of it.
+/// Bytes that an intersection takes at most at any one time: while the lists are made, or then with
+/// the bytes `kept` of it.
 fn bytes_per_intersection(kept: usize) -> u64 {
-    // Tiles of the emission, whose vectors grow by doubling; owners, intersections, splats and places.
+    // Tiles of the emission, whose vectors grow by doubling; owners, intersections, splats and
+    // places.
     let while_listed = (2 + 4) * size_of::<u32>();
     let listed = 2 * size_of::<u32>();
     while_listed.max(listed + kept) as u64
@@ -71,8 +75,9 @@ fn max_intersections() -> u64 {
 #[cfg(test)]
 use tests::max_intersections;
 
-/// The Gaussians among some that can be seen anywhere: not culled, not too faint, and no NaN decides it. One with a colour
-/// that is not finite is left out too: it would be in every pixel it touches.
+/// The Gaussians among some that can be seen anywhere: not culled, not too faint, and no NaN
+/// decides it. One with a colour that is not finite is left out too: it would be in every pixel it
+/// touches.
 fn visible<T: Real>(
     gaussians: Range<usize>,
     [packed, colors, opacities]: [&[T]; 3],
@@ -113,8 +118,8 @@ pub(super) struct TileLists {
 }
 
 impl TileLists {
-    /// Lists for one camera, and its listed splats: packed splats `[N, 9]`, colours `[N, D]` and opacities `[N]`. Of each
-    /// intersection the caller keeps `kept` bytes.
+    /// Lists for one camera, and its listed splats: packed splats `[N, 9]`, colours `[N, D]` and
+    /// opacities `[N]`. Of each intersection the caller keeps `kept` bytes.
     pub(super) fn new<T: Real>(
         [packed, colors, opacities]: [&[T]; 3],
         args: &RasterizeArgs,

@@ -1,7 +1,7 @@
 //! Small vectors and matrices, in rows.
 //!
-//! For loops that are to become SIMD code: no branch, and no array method that takes a closure (`map`, `from_fn`), whose
-//! inner functions the compiler may leave in another unit, as calls.
+//! For loops that are to become SIMD code: no branch, and no array method that takes a closure
+//! (`map`, `from_fn`), whose inner functions the compiler may leave in another unit, as calls.
 
 use super::real::Real;
 
@@ -80,8 +80,9 @@ pub(super) fn add3<T: Real>(a: &Mat3<T>, b: &Mat3<T>) -> Mat3<T> {
     [add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2])]
 }
 
-/// Unit quaternion (w, x, y, z), the length it had, and whether it had one and is finite; what is returned otherwise has
-/// no meaning. Scaled by the largest entry first, so that neither tiny nor huge ones under- or overflow.
+/// Unit quaternion (w, x, y, z), the length it had, and whether it had one and is finite; what is
+/// returned otherwise has no meaning. Scaled by the largest entry first, so that neither tiny nor
+/// huge ones under- or overflow.
 #[inline(always)]
 pub(super) fn normalize_quat<T: Real>(q: [T; 4]) -> ([T; 4], T, bool) {
     let mut largest = T::ZERO;

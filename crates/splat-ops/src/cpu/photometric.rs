@@ -1,5 +1,6 @@
-//! Mean absolute difference and mean structural similarity of two pictures in one sweep over their rows, and with it
-//! the gradient of the similarity. The gradient of the loss is then one more pass.
+//! Mean absolute difference and mean structural similarity of two pictures in one sweep over their
+//! rows, and with it the gradient of the similarity. The gradient of the loss is then one more
+//! pass.
 
 mod pictures;
 mod rows;
@@ -20,8 +21,8 @@ use crate::settings::SsimArgs;
 use pictures::{Pictures, spread};
 use sweep::{Scratch, Sweep};
 
-/// Rows per unit of parallel work. What lies under the window beyond a band is computed by both neighbours, which makes few
-/// rows dear; many leave nothing to share out at the end.
+/// Rows per unit of parallel work. What lies under the window beyond a band is computed by both
+/// neighbours, which makes few rows dear; many leave nothing to share out at the end.
 const BAND: RangeInclusive<usize> = 32..=128;
 
 impl PhotometricOps for Flex {

@@ -12,9 +12,9 @@
 //! inverse Cholesky factor: w11 = 1/sqrt(a),  w22 = sqrt(a/det),  w21 = -(b/a) w22
 //! ```
 //!
-//! `a c - b b` would lose the determinant of a needle in single precision; the minors keep it.
-//! V and e are taken in units of the splat's own size (`k` pixels), so that nothing over- or underflows, be the splat
-//! a millionth of a pixel or a million pictures wide.
+//! `a c - b b` would lose the determinant of a needle in single precision; the minors keep it. V
+//! and e are taken in units of the splat's own size (`k` pixels), so that nothing over- or
+//! underflows, be the splat a millionth of a pixel or a million pictures wide.
 
 mod camera;
 mod gradient;
@@ -77,7 +77,8 @@ impl<'a, T: Real> Inputs<'a, T> {
         self.means.len() / 3
     }
 
-    /// Up to [`LANES`] Gaussians in columns. Lanes beyond them hold a quaternion of length zero: culled.
+    /// Up to [`LANES`] Gaussians in columns. Lanes beyond them hold a quaternion of length zero:
+    /// culled.
     fn load(&self, rows: impl Iterator<Item = usize>) -> [Lanes<T>; GAUSSIAN] {
         let mut columns = [[T::ZERO; LANES]; GAUSSIAN];
         for (lane, n) in rows.enumerate() {
@@ -178,8 +179,8 @@ fn forward<T: Real>(
 }
 
 vectorized! {
-    /// Gradients of a block of Gaussians in one camera, and what they add to those of the camera, if anybody wants them;
-    /// nothing where culled.
+    /// Gradients of a block of Gaussians in one camera, and what they add to those of the camera,
+    /// if anybody wants them; nothing where culled.
     fn project_lanes_backward<T: Real, const FMA: bool>(
         gaussians: &[Lanes<T>; GAUSSIAN],
         camera: &Camera<T>,

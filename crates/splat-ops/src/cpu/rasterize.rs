@@ -1,6 +1,7 @@
 //! Blending of the splats of each tile, and its gradient.
 //!
-//! Per pixel, front to back over the tile's list (3DGS eq. 3, appendix C), T being the transmittance:
+//! Per pixel, front to back over the tile's list (3DGS eq. 3, appendix C), T being the
+//! transmittance:
 //!
 //! ```text
 //! z1 = w11 dx,  z2 = w21 dx + w22 dy,  raw = o exp(-(z1^2 + z2^2) / 2)
@@ -8,9 +9,10 @@
 //! image += c alpha T;  T *= 1 - alpha
 //! ```
 //!
-//! Splats are prepared once per view. A tile is worked on in blocks of four by four pixels, each with the splats whose
-//! ellipse reaches it; both directions go over these in several short passes without branches. The pixels of a block lie in
-//! registers (`pixels.rs`), as wide as those of the processor found at run time.
+//! Splats are prepared once per view. A tile is worked on in blocks of four by four pixels, each
+//! with the splats whose ellipse reaches it; both directions go over these in several short passes
+//! without branches. The pixels of a block lie in registers (`pixels.rs`), as wide as those of the
+//! processor found at run time.
 
 mod batch;
 mod blend;

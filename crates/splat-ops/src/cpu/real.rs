@@ -45,7 +45,8 @@ pub(crate) trait Real:
     /// Type of [`sort_key`](Self::sort_key).
     type SortKey: Ord + Copy + Send + Sync;
 
-    /// An integer that sorts as the number does (negative ones too), and equal numbers as `index` does.
+    /// An integer that sorts as the number does (negative ones too), and equal numbers as `index`
+    /// does.
     fn sort_key(self, index: u32) -> Self::SortKey;
     /// The index in a key.
     fn index_of(key: Self::SortKey) -> u32;
@@ -60,13 +61,15 @@ pub(crate) trait Real:
     /// A whole number below 2^24.
     fn of_index(index: i32) -> Self;
     fn sqrt(self) -> Self;
-    /// The natural logarithm of a normal number above zero, to 3e-7 of itself or of one, whichever is more.
+    /// The natural logarithm of a normal number above zero, to 3e-7 of itself or of one, whichever
+    /// is more.
     fn ln(self) -> Self;
     fn abs(self) -> Self;
     fn is_finite(self) -> bool;
     /// `a b + c`, in one rounding where `FMA` says that this is one instruction.
     fn multiply_add<const FMA: bool>(a: Self, b: Self, c: Self) -> Self;
-    /// `2^-t` for `t >= 0`, of several registers; anything under 1e-30 may come out as any such value.
+    /// `2^-t` for `t >= 0`, of several registers; anything under 1e-30 may come out as any such
+    /// value.
     fn exp2_neg<S: Simd>(t: &mut [Vector<S, Self>]);
 
     /// `exp(x)`, to 2 units in the last place.
@@ -258,10 +261,10 @@ impl Real for f32 {
     }
 }
 
-/// `2^-t` as `2^n 2^-g` with `|g| <= 1/2`: g is exact, and a polynomial stands for `2^-g`. Against f64 on [0, 24]: relative
-/// error below 2e-7 (see the test), fused or not.
-// Step by step for all registers: what follows in one waits for what came before, and a processor looks only so far ahead for
-// something else to do.
+/// `2^-t` as `2^n 2^-g` with `|g| <= 1/2`: g is exact, and a polynomial stands for `2^-g`. Against
+/// f64 on [0, 24]: relative error below 2e-7 (see the test), fused or not.
+// Step by step for all registers: what follows in one waits for what came before, and a processor
+// looks only so far ahead for something else to do.
 #[inline(always)]
 fn exp2_neg_f32<S: Simd>(t: &mut [Vector<S, f32>]) {
     let zero = 0f32.splat();
@@ -318,14 +321,15 @@ fn exp_f32<const FMA: bool>(x: f32) -> f32 {
     let n = shifted - ROUND;
     let r = multiply_add(-n, LN2_LOW, multiply_add(-n, LN2_HIGH, x));
     let p = polynomial::<FMA>(&EXP, r);
-    // n may be 128, or -150: neither is the exponent of a normal number, but those of its halves are.
+    // n may be 128, or -150: neither is the exponent of a normal number, but those of its halves
+    // are.
     let n = (shifted.to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32);
     let half = n >> 1;
     p * two_to(half) * two_to(n.wrapping_sub(half))
 }
 
-/// `ln(2^n m) = n ln(2) + ln(m)` with m between the square roots of 1/2 and 2, and `ln(m) = 2 artanh(s)` as a series in
-/// `s = (m - 1) / (m + 1)`.
+/// `ln(2^n m) = n ln(2) + ln(m)` with m between the square roots of 1/2 and 2, and `ln(m) = 2
+/// artanh(s)` as a series in `s = (m - 1) / (m + 1)`.
 #[inline(always)]
 fn ln_f32(x: f32) -> f32 {
     const ROOT_HALF: u32 = core::f32::consts::FRAC_1_SQRT_2.to_bits();

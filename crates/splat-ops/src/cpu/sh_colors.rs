@@ -1,7 +1,7 @@
 //! Colours in the directions of the cameras, `max(SH(mean - centre) + 0.5, 0)`, and their gradient.
 //!
-//! Directions and basis functions are the same arithmetic for every Gaussian: in columns, as SIMD code. Coefficients lie
-//! in rows, and are read and written there.
+//! Directions and basis functions are the same arithmetic for every Gaussian: in columns, as SIMD
+//! code. Coefficients lie in rows, and are read and written there.
 
 use core::marker::PhantomData;
 
@@ -69,8 +69,8 @@ impl<'a, T: Real> Inputs<'a, T> {
         (&self.centers[3 * camera..3 * camera + 3], is_seen)
     }
 
-    /// Some coefficients of one Gaussian, from the one after the first; each with the number that follows it in memory, or
-    /// zero, as four numbers are read at once.
+    /// Some coefficients of one Gaussian, from the one after the first; each with the number that
+    /// follows it in memory, or zero, as four numbers are read at once.
     #[inline(always)]
     fn rest<const REST: usize>(&self, n: usize) -> [[T; 4]; REST] {
         let row = &self.rest[3 * self.stored * n..][..3 * REST];
@@ -103,7 +103,8 @@ impl<'a, T: Real> Inputs<'a, T> {
     }
 
     /// The colours of some Gaussians before the clamp, given the basis in their directions.
-    // Four numbers each, of which one means nothing: written to memory, all of them have to be computed, side by side.
+    // Four numbers each, of which one means nothing: written to memory, all of them have to be
+    // computed, side by side.
     #[inline(always)]
     fn colors<const REST: usize>(
         &self,
@@ -128,8 +129,8 @@ impl<'a, T: Real> Inputs<'a, T> {
     }
 }
 
-/// Calls a function for the number of coefficients beyond the first that the degree reads, which the compiler then knows:
-/// `function::<.., COUNT>(...)`.
+/// Calls a function for the number of coefficients beyond the first that the degree reads, which
+/// the compiler then knows: `function::<.., COUNT>(...)`.
 macro_rules! by_degree {
     ($degree:expr, $function:ident::<$($generic:ident),+>($($argument:expr),* $(,)?)) => {
         match $degree {
@@ -144,8 +145,8 @@ macro_rules! by_degree {
 mod backward;
 
 vectorized! {
-    /// Writes the colours of some Gaussians to where they lie behind that of the `first`, given the basis in their
-    /// directions.
+    /// Writes the colours of some Gaussians to where they lie behind that of the `first`, given the
+    /// basis in their directions.
     fn colors_of_rows<T: Real, const FMA: bool>(
         inputs: &Inputs<T>,
         rows: &[usize],

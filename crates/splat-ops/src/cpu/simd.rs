@@ -2,12 +2,13 @@
 
 use core::ops::Range;
 
-/// Defines a function whose body is compiled for the baseline, for AVX2 with FMA and for AVX-512, and which takes the
-/// best that the processor can run. What the body calls must be `#[inline(always)]`, or it stays compiled for the
-/// baseline.
+/// Defines a function whose body is compiled for the baseline, for AVX2 with FMA and for AVX-512,
+/// and which takes the best that the processor can run. What the body calls must be
+/// `#[inline(always)]`, or it stays compiled for the baseline.
 ///
-/// `FMA` tells the body whether fused products and sums are instructions (they are calls otherwise).
-/// Rust never fuses by itself: where the body does not ask for it, the numbers are the same either way.
+/// `FMA` tells the body whether fused products and sums are instructions (they are calls
+/// otherwise). Rust never fuses by itself: where the body does not ask for it, the numbers are the
+/// same either way.
 macro_rules! vectorized {
     (
         $(#[$meta:meta])*
@@ -65,11 +66,12 @@ pub(super) fn prefetch<V>(items: &[V], range: Range<usize>) {
     let _ = (items, range);
 }
 
-/// Rows that are worked on together. Large enough for any register, small enough for dozens of columns in the first-level
-/// cache.
+/// Rows that are worked on together. Large enough for any register, small enough for dozens of
+/// columns in the first-level cache.
 pub(super) const LANES: usize = 32;
 
-/// One number of each of [`LANES`] rows. A loop over lanes, without branches and calls, becomes SIMD code.
+/// One number of each of [`LANES`] rows. A loop over lanes, without branches and calls, becomes
+/// SIMD code.
 pub(super) type Lanes<T> = [T; LANES];
 
 /// Hands out those of the rows that `is_kept`, in order, up to [`LANES`] at a time.

@@ -176,15 +176,15 @@ fn forward<T: Real>(
     tensor(colors, [c, n, 3])
 }
 
-/// Nothing was seen of it: the rule for most splats of most views. Zero times NaN must not come out of one that is
-/// broken either; its gradient would reach the camera's.
+/// Nothing was seen of it: the rule for most splats of most views. Zero times NaN must not come out
+/// of one that is broken either; its gradient would reach the camera's.
 #[inline(always)]
 pub(super) fn is_zero<T: Real>(grad: &[T]) -> bool {
     grad.iter().all(|g| *g == T::ZERO)
 }
 
-/// `grad . coeff`, where a channel without gradient (black, and clamped there) does not look at its coefficient, which
-/// may be infinite.
+/// `grad . coeff`, where a channel without gradient (black, and clamped there) does not look at its
+/// coefficient, which may be infinite.
 // Every product is computed, so that no branch is needed.
 #[inline(always)]
 pub(super) fn guarded_dot<T: Real>(grad: Vec3<T>, coeff: Vec3<T>) -> T {

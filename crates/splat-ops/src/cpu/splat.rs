@@ -3,8 +3,8 @@
 use super::buffer::Overwritten;
 use super::real::Real;
 
-/// The inverse Cholesky factor times this, squared, counts in powers of two: `2^-|z|^2 = exp(-sigma)`.
-/// `sqrt(log2(e) / 2)`.
+/// The inverse Cholesky factor times this, squared, counts in powers of two: `2^-|z|^2 =
+/// exp(-sigma)`. `sqrt(log2(e) / 2)`.
 pub(super) const UNIT: f64 = 0.849_321_800_288_019_1;
 
 /// How many numbers a splat has beside its colour.
@@ -13,9 +13,9 @@ pub(super) const NUMBERS: usize = 11;
 /// Channels that are worked on at once.
 pub(super) const GROUP: usize = 4;
 
-/// A splat as the inner loops need it, in one line of the cache if in single precision. Its ellipse is the part of it that
-/// can pass the `alpha_min` test: `sigma <= cut`, cut being `ln(opacity / alpha_min)`, widened by a little so that rounding
-/// never drops a pixel.
+/// A splat as the inner loops need it, in one line of the cache if in single precision. Its ellipse
+/// is the part of it that can pass the `alpha_min` test: `sigma <= cut`, cut being `ln(opacity /
+/// alpha_min)`, widened by a little so that rounding never drops a pixel.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(align(64))]
 pub(super) struct Splat<T> {
@@ -102,7 +102,8 @@ impl<T: Copy> Splat<T> {
 }
 
 impl<T: Real> Splat<T> {
-    /// From screen mean, inverse Cholesky factor and opacity, without a colour; and half the height of its ellipse.
+    /// From screen mean, inverse Cholesky factor and opacity, without a colour; and half the height
+    /// of its ellipse.
     #[inline(always)]
     pub(super) fn new([x, y, w11, w21, w22, opacity]: [T; 6], alpha_min: T) -> (Self, T) {
         let cut = (opacity / alpha_min).ln();
@@ -127,8 +128,8 @@ impl<T: Real> Splat<T> {
         (splat, radius * a.sqrt() / (w11 * w22))
     }
 
-    /// Where between two rows the ellipse lies farthest right, or with a sign of -1 left, and whether it lies there at
-    /// all. All seen from its mean.
+    /// Where between two rows the ellipse lies farthest right, or with a sign of -1 left, and
+    /// whether it lies there at all. All seen from its mean.
     #[inline(always)]
     pub(super) fn farthest(&self, sign: T, [first, last]: [T; 2]) -> (T, bool) {
         let dy = (sign * self.end).greatest(first).least(last);

@@ -1,5 +1,6 @@
-//! Memory that threads write in parts. Each part is cleared by the thread that writes it and just before, while it lies in
-//! that core's cache: all of it at once would go through the machine's memory once more.
+//! Memory that threads write in parts. Each part is cleared by the thread that writes it and just
+//! before, while it lies in that core's cache: all of it at once would go through the machine's
+//! memory once more.
 
 use core::mem::MaybeUninit;
 use core::sync::atomic::{AtomicUsize, Ordering::Relaxed};
@@ -84,8 +85,8 @@ impl<T: Overwritten> Uncleared<T> {
             mut cleared,
         } = self;
         assert_eq!(*cleared.get_mut(), length, "a part was never cleared");
-        // SAFETY: parts do not overlap, and one is cleared once, as that consumes it; so those handed out last, which
-        // have cleared as many values as there are, have cleared all.
+        // SAFETY: parts do not overlap, and one is cleared once, as that consumes it; so those
+        // handed out last, which have cleared as many values as there are, have cleared all.
         unsafe { values.set_len(length) };
         values
     }

@@ -38,13 +38,13 @@ fn prepare(tensor: CubeTensor) -> CubeTensor {
 /// The memory of a tensor that went through [`prepare`].
 fn buffer(tensor: &CubeTensor) -> Buffer {
     let len = tensor.shape().num_elements();
-    // A contiguous tensor of f32 holds its elements. One that did not would be read as empty: every kernel checks
-    // bounds.
+    // A contiguous tensor of f32 holds its elements. One that did not would be read as empty: every
+    // kernel checks bounds.
     Buffer::new(tensor.handle.clone(), len).unwrap_or_else(|_| Buffer::empty(&tensor.client, 0))
 }
 
-/// The same, of a tensor that nothing else needs: where nothing else holds the memory, a kernel may write into it. And
-/// what makes a tensor of a buffer, like the one that was taken.
+/// The same, of a tensor that nothing else needs: where nothing else holds the memory, a kernel may
+/// write into it. And what makes a tensor of a buffer, like the one that was taken.
 fn taken(tensor: CubeTensor) -> (Buffer, impl FnOnce(Buffer) -> CubeTensor) {
     let shape = tensor.shape();
     let CubeTensor {

@@ -1,5 +1,5 @@
-//! The photometric loss on CubeCL devices. The photo is read as it is stored. A window so long that its tiles do not fit
-//! into shared memory takes the way of tensor ops.
+//! The photometric loss on CubeCL devices. The photo is read as it is stored. A window so long that
+//! its tiles do not fit into shared memory takes the way of tensor ops.
 
 use burn::backend::TensorMetadata;
 use burn::tensor::{DType, Shape};

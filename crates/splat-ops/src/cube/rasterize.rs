@@ -56,8 +56,8 @@ fn op_error(error: IntersectError) -> OpError {
     }
 }
 
-/// The rasteriser's gradient binds the most buffers. wgpu would refuse its kernels when they are launched, which
-/// shows when a gradient is read, if it is.
+/// The rasteriser's gradient binds the most buffers. wgpu would refuse its kernels when they are
+/// launched, which shows when a gradient is read, if it is.
 fn enough_bindings(client: &Client) -> Result<(), OpError> {
     let (bound, needed) = (bindable_buffers(client), MOST_BUFFERS);
     if bound >= needed {
@@ -140,8 +140,8 @@ impl RasterizeBackend for CubeBackend {
     }
 }
 
-/// The evaluations of a forward pass, counted on the device of `client`. Through the host: packed splats, colours
-/// `[C, N, D]` and opacities `[C, N]` are measured once, not often.
+/// The evaluations of a forward pass, counted on the device of `client`. Through the host: packed
+/// splats, colours `[C, N, D]` and opacities `[C, N]` are measured once, not often.
 #[cfg(feature = "cpu")]
 pub(crate) fn work(
     client: &Client,

@@ -14,7 +14,8 @@ use crate::backend::{
 };
 use crate::settings::ShColorSettings;
 
-/// The inputs, ready for the kernels, which read the higher coefficients in both of the types that the op takes.
+/// The inputs, ready for the kernels, which read the higher coefficients in both of the types that
+/// the op takes.
 fn prepared(
     inputs: ShColorTensors<CubeTensor, Option<CubeTensor>>,
 ) -> ShColorTensors<CubeTensor, Option<CubeTensor>> {

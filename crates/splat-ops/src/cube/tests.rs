@@ -203,7 +203,8 @@ fn structural_similarity_and_its_gradients_are_those_of_the_native_path() {
     if !has_adapter() {
         return;
     }
-    // Windows whose loops are unrolled, one whose loops are not, and images smaller than the window.
+    // Windows whose loops are unrolled, one whose loops are not, and images smaller than the
+    // window.
     for (shape, taps) in [
         ([2, 19, 23, 3], 11),
         ([1, 5, 40, 1], 11),
@@ -225,15 +226,17 @@ fn structural_similarity_and_its_gradients_are_those_of_the_native_path() {
         for (what, (kernels, native)) in ["map", "x", "y"].iter().zip(kernels.iter().zip(&native)) {
             let error = relative_l2(kernels, native);
             println!("{shape:?}, {taps} taps, {what}: relative L2 {error:.1e}");
-            // A window of one value alone measures no contrast: c2 / c2 up to rounding, and no gradient through it.
+            // A window of one value alone measures no contrast: c2 / c2 up to rounding, and no
+            // gradient through it.
             let limit = if taps == 1 { 1e-4 } else { 1e-5 };
             assert!(error <= limit, "{shape:?}, {taps} taps, {what}: {error:e}");
         }
     }
 }
 
-/// Three steps of Adam; a gradient in the second is not a number, one in the third too large to be squared. Some rows
-/// have no gradient, one nothing but NaN, one nothing but infinity. What went into the first step is `held` or given away.
+/// Three steps of Adam; a gradient in the second is not a number, one in the third too large to be
+/// squared. Some rows have no gradient, one nothing but NaN, one nothing but infinity. What went
+/// into the first step is `held` or given away.
 fn run_adam(device: &Device, rows: AdamRows, held: bool) -> Vec<f32> {
     let mut rng = Pcg32::seed_from_u64(12);
     let mut values = |low: f32, high: f32| {
@@ -348,7 +351,8 @@ fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
     if !has_adapter() {
         return;
     }
-    // 12,000 splats over each of 4096 x 4 tiles: more than the 195 million intersections that can be listed.
+    // 12,000 splats over each of 4096 x 4 tiles: more than the 195 million intersections that can
+    // be listed.
     let n = 12_000;
     let size = ImageSize {
         width: 65_536,
@@ -381,7 +385,8 @@ fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
     );
 }
 
-/// A device of wgpu's that has no more of `max_storage_buffers_per_shader_stage` than WebGPU promises.
+/// A device of wgpu's that has no more of `max_storage_buffers_per_shader_stage` than WebGPU
+/// promises.
 fn device_with_webgpu_bindings() -> Option<Device> {
     use cubecl::wgpu::WgpuSetup;
     use cubecl::wgpu::wgpu::{DeviceDescriptor, Instance, Limits, RequestAdapterOptions};

@@ -5,8 +5,8 @@ use burn::tensor::{Tensor, TensorData};
 use super::devices;
 use crate::{exp, sigmoid};
 
-/// Against double precision: at both ends, at the bend, and between. Below a logit of -87 the opacity itself leaves the
-/// range of normal floats.
+/// Against double precision: at both ends, at the bend, and between. Below a logit of -87 the
+/// opacity itself leaves the range of normal floats.
 #[test]
 fn activations_and_their_gradients_keep_their_digits() {
     let at = [-80.0, -30.0, -5.0, -0.1, 0.0, 0.1, 5.0, 17.0, 30.0, 80.0f32];

@@ -1,9 +1,10 @@
-//! The backward pass decides about every (pixel, splat) pair as the forward pass did, also within a few units in the
-//! last place of a threshold: 1,075,200 pairs.
+//! The backward pass decides about every (pixel, splat) pair as the forward pass did, also within a
+//! few units in the last place of a threshold: 1,075,200 pairs.
 //!
-//! Splats so wide that alpha differs by a few units over a tile lie on the threshold. Each has its own camera with an
-//! image of one tile. Every pixel has a whole number for its gradient: the sum over those that the backward pass takes
-//! for blended can be read off the splat's gradient, and the same sum over those that are lit off the image.
+//! Splats so wide that alpha differs by a few units over a tile lie on the threshold. Each has its
+//! own camera with an image of one tile. Every pixel has a whole number for its gradient: the sum
+//! over those that the backward pass takes for blended can be read off the splat's gradient, and
+//! the same sum over those that are lit off the image.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
@@ -16,14 +17,16 @@ const CAMERAS: usize = 1400;
 const SIDE: usize = 16;
 const PIXELS: usize = SIDE * SIDE;
 
-/// The image `[C, PIXELS]` of the splats' only channel, and the gradients `[C, N]` of colours and opacities.
+/// The image `[C, PIXELS]` of the splats' only channel, and the gradients `[C, N]` of colours and
+/// opacities.
 struct Outcome {
     image: Vec<f32>,
     colors: Vec<f32>,
     opacities: Vec<f32>,
 }
 
-/// One tile per camera, seen through `opacities` `[C, N]`; of each camera's splats only the last one shines.
+/// One tile per camera, seen through `opacities` `[C, N]`; of each camera's splats only the last
+/// one shines.
 fn render(
     device: &Device,
     opacities: &[f32],
@@ -87,8 +90,8 @@ fn around(value: f32, reach: u32) -> impl Iterator<Item = f32> {
     (0..CAMERAS).map(move |_| f32::from_bits(value.to_bits() + rng.random_range(0..=reach)))
 }
 
-/// For each camera: the weights of the pixels that `chosen` picks by their value, summed, against what the backward
-/// pass says; and both outcomes must be frequent.
+/// For each camera: the weights of the pixels that `chosen` picks by their value, summed, against
+/// what the backward pass says; and both outcomes must be frequent.
 fn check(
     name: &str,
     image: &[f32],
@@ -143,7 +146,8 @@ fn backward_caps_what_forward_capped() {
     let weights = weights();
     for (name, device) in devices() {
         let outcome = render(&device, &opacities, &weights, &settings);
-        // The splat is the first one and its colour 1: the image is alpha, and the gradient of alpha the weight.
+        // The splat is the first one and its colour 1: the image is alpha, and the gradient of
+        // alpha the weight.
         check(
             &format!("{name}: below the cap"),
             &outcome.image,
@@ -156,7 +160,8 @@ fn backward_caps_what_forward_capped() {
 
 #[test]
 fn backward_stops_where_forward_stopped() {
-    // Half of the light passes the first splat, half of that the second: to within a few units as much as the stop.
+    // Half of the light passes the first splat, half of that the second: to within a few units as
+    // much as the stop.
     let settings = RasterizeSettings {
         transmittance_min: 0.25,
         ..Default::default()

@@ -7,7 +7,8 @@ use rand_pcg::Pcg32;
 use super::devices;
 use crate::{SsimArgs, Target, photometric, ssim_map};
 
-/// B, H, W, D, E: one band and one strip, odd sizes, several of both, and sizes smaller than the window.
+/// B, H, W, D, E: one band and one strip, odd sizes, several of both, and sizes smaller than the
+/// window.
 const SHAPES: [[usize; 5]; 8] = [
     [1, 24, 32, 3, 4],
     [2, 61, 37, 3, 3],
@@ -239,7 +240,8 @@ fn what_does_not_fit_is_refused() {
     assert!(photometric(zeros([1, 12, 13, 3]), zeros([1, 12, 13, 3]), &even).is_err());
 }
 
-/// Pixels that the mask leaves out count in neither value nor gradient, and one that keeps all is none.
+/// Pixels that the mask leaves out count in neither value nor gradient, and one that keeps all is
+/// none.
 #[test]
 fn a_mask_leaves_pixels_out() {
     for (_, device) in devices() {

@@ -1,5 +1,6 @@
-//! Every element of outputs and of scratch memory is written before it is read: with reserved memory full of NaN all
-//! ops give the same bits, in images and all gradients, and every one is finite.
+//! Every element of outputs and of scratch memory is written before it is read: with reserved
+//! memory full of NaN all ops give the same bits, in images and all gradients, and every one is
+//! finite.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
@@ -30,8 +31,8 @@ struct Scene {
 }
 
 impl Scene {
-    /// Results of every op and all gradients, as bits. Splats lie in the left part of the image, some behind the
-    /// cameras and some too faint to be seen.
+    /// Results of every op and all gradients, as bits. Splats lie in the left part of the image,
+    /// some behind the cameras and some too faint to be seen.
     fn run(&self, device: &Device) -> Vec<(&'static str, Vec<u32>)> {
         let (c, n, d) = (self.cameras, self.gaussians, self.channels);
         let device = device.clone().autodiff();

@@ -1,4 +1,5 @@
-//! Gradients of a projection do not depend on which others are asked for; splats on the border are culled.
+//! Gradients of a projection do not depend on which others are asked for; splats on the border are
+//! culled.
 
 use burn::tensor::{Device, Tensor, TensorData};
 
@@ -79,7 +80,8 @@ fn a_gradient_alone_is_the_same_as_with_all_others() {
     }
 }
 
-/// The packed row of a Gaussian on the axis of a camera with the principal point (cx, cy), so that its mean lies there.
+/// The packed row of a Gaussian on the axis of a camera with the principal point (cx, cy), so that
+/// its mean lies there.
 fn on_axis(device: &Device, size: ImageSize, [cx, cy]: [f32; 2]) -> [f32; 9] {
     let at = |values: Vec<f32>| {
         let width = values.len();
@@ -109,7 +111,8 @@ fn on_axis(device: &Device, size: ImageSize, [cx, cy]: [f32; 2]) -> [f32; 9] {
 
 #[test]
 fn a_splat_whose_box_only_touches_the_border_is_culled() {
-    // So large that a border plus an extent, less the extent, is the border: both sums have as fine digits.
+    // So large that a border plus an extent, less the extent, is the border: both sums have as fine
+    // digits.
     let size = ImageSize {
         width: 40,
         height: 40,

@@ -1,4 +1,5 @@
-//! `sh_colors` against the ops it is made of: values and all gradients, in double precision and on every device.
+//! `sh_colors` against the ops it is made of: values and all gradients, in double precision and on
+//! every device.
 
 use burn::tensor::{Bool, DType, Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
@@ -20,8 +21,9 @@ struct Leaves {
 }
 
 impl Leaves {
-    /// Some colours are far below zero, one exactly zero, the first mean is at the first camera's centre; every third
-    /// Gaussian is unseen (see [`weights`]), and the coefficients of one of those are not numbers.
+    /// Some colours are far below zero, one exactly zero, the first mean is at the first camera's
+    /// centre; every third Gaussian is unseen (see [`weights`]), and the coefficients of one of
+    /// those are not numbers.
     fn new(c: usize, n: usize, device: &Device, dtype: DType) -> Self {
         let mut rng = Pcg32::seed_from_u64(70);
         let mut values =
@@ -153,7 +155,8 @@ fn colors_and_gradients_are_those_of_the_composed_ops() {
     }
 }
 
-/// All else is as without it, bit for bit; whatever lies behind gives what is culled a gradient that must not arrive.
+/// All else is as without it, bit for bit; whatever lies behind gives what is culled a gradient
+/// that must not arrive.
 #[test]
 fn what_a_camera_culled_is_black_and_gets_no_gradient() {
     let mut cases: Vec<_> = devices()
@@ -165,8 +168,8 @@ fn what_a_camera_culled_is_black_and_gets_no_gradient() {
         let device = device.autodiff();
         for (c, n, degree) in [(1, 700, 3), (2, 65, 0), (3, 33, 2), (1, 1100, 1)] {
             let leaves = Leaves::new(c, n, &device, dtype);
-            // The third Gaussian, whose coefficients are no numbers, among what no camera sees; the last chunk ends with
-            // some that none sees.
+            // The third Gaussian, whose coefficients are no numbers, among what no camera sees; the
+            // last chunk ends with some that none sees.
             let is_seen = |camera: usize, gaussian: usize| {
                 gaussian % 3 != 2 && !(gaussian + camera).is_multiple_of(5) && gaussian + 4 < n
             };
@@ -204,8 +207,8 @@ fn what_a_camera_culled_is_black_and_gets_no_gradient() {
     }
 }
 
-/// Below zero the exact gradient stops; the recovering one passes on what descent would raise the channel by. Of what is
-/// not clamped both are the same.
+/// Below zero the exact gradient stops; the recovering one passes on what descent would raise the
+/// channel by. Of what is not clamped both are the same.
 #[test]
 fn a_channel_below_zero_can_recover_if_asked_to() {
     const Y0: f32 = splat_core::SH_C0 as f32;
@@ -306,8 +309,9 @@ fn what_does_not_fit_is_an_error() {
     }
 }
 
-/// Colours and gradients where the higher degrees are stored in half precision, against double precision of the
-/// coefficients before they were rounded; and those of exact ones. Bright ones: at the clamp the gradient has a step.
+/// Colours and gradients where the higher degrees are stored in half precision, against double
+/// precision of the coefficients before they were rounded; and those of exact ones. Bright ones: at
+/// the clamp the gradient has a step.
 #[test]
 fn half_precision_costs_so_much() {
     let (c, n) = (2, 2500);

@@ -85,8 +85,8 @@ impl TrainerBuilder {
         }
     }
 
-    /// Trains another model than [`Gaussians`], made of the first Gaussians on a device. To be called before
-    /// [`strategy`](TrainerBuilder::strategy), whose type follows from it.
+    /// Trains another model than [`Gaussians`], made of the first Gaussians on a device. To be
+    /// called before [`strategy`](TrainerBuilder::strategy), whose type follows from it.
     pub fn model<M: SplatModel>(
         self,
         make: impl FnOnce(&SplatData, &Device) -> M + Send + 'static,
@@ -119,8 +119,8 @@ impl<M: SplatModel> TrainerBuilder<M> {
         self
     }
 
-    /// Which Gaussians there are, and what else changes from step to step. Default: [`Adc`] with the settings'
-    /// `density`.
+    /// Which Gaussians there are, and what else changes from step to step. Default: [`Adc`] with
+    /// the settings' `density`.
     pub fn strategy(mut self, strategy: impl Strategy<M> + 'static) -> Self {
         self.strategy = Some(Box::new(strategy));
         self
@@ -154,14 +154,15 @@ impl<M: SplatModel> TrainerBuilder<M> {
         self
     }
 
-    /// The run does what it is told here between its steps, see [`command_queue`](super::command_queue).
+    /// The run does what it is told here between its steps, see
+    /// [`command_queue`](super::command_queue).
     pub fn commands(mut self, commands: Receiver<Command>) -> Self {
         self.watch.commands = Commands::new(Some(commands));
         self
     }
 
-    /// Goes on from a checkpoint instead of the capture's points. The capture must be that of the checkpoint, and so
-    /// must the settings, see [`Checkpoint::check_settings`].
+    /// Goes on from a checkpoint instead of the capture's points. The capture must be that of the
+    /// checkpoint, and so must the settings, see [`Checkpoint::check_settings`].
     pub fn resume(mut self, checkpoint: Checkpoint) -> Self {
         self.resume = Some(checkpoint);
         self
@@ -173,8 +174,8 @@ impl<M: SplatModel> TrainerBuilder<M> {
         self
     }
 
-    /// Calls `save` every so often, so that a crash loses no more than that much time. When it fails the run goes on
-    /// with a warning, one for each kind of failure. Default: never.
+    /// Calls `save` every so often, so that a crash loses no more than that much time. When it
+    /// fails the run goes on with a warning, one for each kind of failure. Default: never.
     pub fn autosave(
         mut self,
         every: Duration,
@@ -195,7 +196,8 @@ impl<M: SplatModel> TrainerBuilder<M> {
         self
     }
 
-    /// Called when something looks wrong; [`History::warnings`] keeps what is wrong with the run itself.
+    /// Called when something looks wrong; [`History::warnings`] keeps what is wrong with the run
+    /// itself.
     pub fn on_warning(mut self, callback: impl FnMut(&Warning) + Send + 'static) -> Self {
         self.watch.on_warning = Box::new(callback);
         self
@@ -204,8 +206,8 @@ impl<M: SplatModel> TrainerBuilder<M> {
     /// Checks everything and makes the first Gaussians.
     ///
     /// # Errors
-    /// When there is nothing in the capture to train on, a setting is out of range, the model, the strategy or a hook
-    /// cannot be used, or the checkpoint to resume from is another run's.
+    /// When there is nothing in the capture to train on, a setting is out of range, the model, the
+    /// strategy or a hook cannot be used, or the checkpoint to resume from is another run's.
     pub fn build(mut self) -> Result<Trainer<M>, TrainError> {
         self.config.validate().map_err(TrainError::Config)?;
         self.capture.check_trainable()?;

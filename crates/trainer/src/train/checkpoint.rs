@@ -1,9 +1,10 @@
-//! The whole state of a run in one safetensors file: the model with the moments of its optimisers, what the strategy and
-//! the hooks keep, how far it got, its settings, and what tells its capture from another. A resumed run goes on with the
-//! same numbers, or not at all.
+//! The whole state of a run in one safetensors file: the model with the moments of its optimisers,
+//! what the strategy and the hooks keep, how far it got, its settings, and what tells its capture
+//! from another. A resumed run goes on with the same numbers, or not at all.
 //!
-//! Tensors are named by what they belong to: `model.means` is a parameter, `[N, width]`, `model.means.moment_1` a moment of
-//! it, `strategy.gradients` what density control has summed up, `hook.exposure.gain` a parameter of the hook `exposure`.
+//! Tensors are named by what they belong to: `model.means` is a parameter, `[N, width]`,
+//! `model.means.moment_1` a moment of it, `strategy.gradients` what density control has summed up,
+//! `hook.exposure.gain` a parameter of the hook `exposure`.
 
 mod check;
 mod error;
@@ -31,7 +32,8 @@ pub(super) use run::RunRecord;
 const VERSION: u32 = 4;
 /// Key of the metadata entry that holds everything but tensors.
 const META: &str = "burn_splat";
-/// Key of the metadata entry with the checksum of everything else: a number that the disk lost would go on silently.
+/// Key of the metadata entry with the checksum of everything else: a number that the disk lost
+/// would go on silently.
 const CHECKSUM: &str = "burn_splat_checksum";
 
 /// Name, shape and values.
@@ -115,8 +117,8 @@ impl Checkpoint {
         self.meta.origin_bits.map(f64::from_bits)
     }
 
-    /// Writes the file beside its place and renames it, so that a crash, of the machine too, leaves the old one or the
-    /// new one.
+    /// Writes the file beside its place and renames it, so that a crash, of the machine too, leaves
+    /// the old one or the new one.
     ///
     /// # Errors
     /// When the disk refuses.
@@ -260,7 +262,8 @@ fn checksum_of(meta: &str, file: &SafeTensors) -> String {
     checksum(meta, contents.collect())
 }
 
-/// Checksum of a file's contents: the metadata, then each tensor's name and bytes in the order of the names.
+/// Checksum of a file's contents: the metadata, then each tensor's name and bytes in the order of
+/// the names.
 fn checksum(meta: &str, mut contents: Vec<(&str, &[u8])>) -> String {
     contents.sort_unstable_by_key(|(name, _)| *name);
     let mut hasher = crc32fast::Hasher::new();

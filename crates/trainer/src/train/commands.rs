@@ -63,8 +63,8 @@ impl Commands {
         }
     }
 
-    /// The next thing to do, waiting for it while the run is paused. A queue whose other end is gone commands nothing: the
-    /// run goes on.
+    /// The next thing to do, waiting for it while the run is paused. A queue whose other end is
+    /// gone commands nothing: the run goes on.
     pub(super) fn next(&mut self, interrupt: &AtomicBool) -> Next {
         loop {
             if interrupt.load(Ordering::Relaxed) {

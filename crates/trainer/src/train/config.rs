@@ -17,7 +17,8 @@ const MOST_HALVINGS: u32 = 8;
 /// Views of a step, all of whose pictures are in memory at once.
 const MOST_VIEWS: usize = 64;
 
-/// More steps are no run: at a thousand a second they take thirty years. Quarters of it and the like can be computed.
+/// More steps are no run: at a thousand a second they take thirty years. Quarters of it and the
+/// like can be computed.
 pub(super) const MOST_STEPS: u64 = 1_000_000_000_000;
 
 /// Settings of a training run; together with the capture and the seed they repeat it.
@@ -25,7 +26,8 @@ pub(super) const MOST_STEPS: u64 = 1_000_000_000_000;
 #[serde(default, deny_unknown_fields)]
 #[setters(prefix = "with_", strip_option)]
 pub struct TrainConfig {
-    /// Number of steps; milestones stated for 30,000 steps shrink with shorter runs. Default 30,000.
+    /// Number of steps; milestones stated for 30,000 steps shrink with shorter runs. Default
+    /// 30,000.
     pub steps: usize,
     /// Seed of every random draw. Default 0.
     pub seed: u64,
@@ -33,12 +35,14 @@ pub struct TrainConfig {
     pub downscale: u32,
     /// Views that a step renders and takes the mean loss of. Default 1.
     pub views_per_step: usize,
-    /// Training begins with photos whose sides are halved so many times, and doubles them step by step (3DGS section 7.1
-    /// has 2: a quarter, then a half). Default 0: photos are as they are from the beginning.
+    /// Training begins with photos whose sides are halved so many times, and doubles them step by
+    /// step (3DGS section 7.1 has 2: a quarter, then a half). Default 0: photos are as they are
+    /// from the beginning.
     pub coarse_halvings: u32,
     /// So many steps of a run of 30,000 until the sides are doubled. Default 250.
     pub coarse_every: usize,
-    /// One more degree of spherical harmonics every so many steps of a run of 30,000. Default 1,000.
+    /// One more degree of spherical harmonics every so many steps of a run of 30,000. Default
+    /// 1,000.
     pub sh_degree_every: usize,
     /// Multiply opacities by what the low-pass filter took away. Default false.
     pub antialias: bool,
@@ -47,8 +51,9 @@ pub struct TrainConfig {
     pub background: Option<[f32; 3]>,
     /// Weight of 1 - SSIM against L1 in the default loss. Default 0.2.
     pub ssim_weight: f64,
-    /// Adam steps only the Gaussians that the view saw, see [`AdamRows::Seen`]. Default false: on a capture where each
-    /// view sees most of them it was no faster, and 0.06 dB worse (50 photos, 2,000 steps, mean of three seeds).
+    /// Adam steps only the Gaussians that the view saw, see [`AdamRows::Seen`]. Default false: on a
+    /// capture where each view sees most of them it was no faster, and 0.06 dB worse (50 photos,
+    /// 2,000 steps, mean of three seeds).
     pub seen_rows_only: bool,
     /// Whether a run repeats bit for bit on a CubeCL device; false saves memory there, see
     /// [`RasterizeSettings::deterministic`]. On the CPU it always does. Default true.
@@ -58,9 +63,10 @@ pub struct TrainConfig {
     /// Learning rates; `rates` in files of before.
     #[serde(alias = "rates")]
     pub learning_rates: LearningRates,
-    /// Adaptive density control. Where `max_gaussians` is absent, growth ends at seven Gaussians for every ten pixels of a
-    /// photo, or one for every hundred of all photos that are trained on (300 values for up to 59 parameters), whichever is
-    /// more; docs/TRAINING.md has what more would give.
+    /// Adaptive density control. Where `max_gaussians` is absent, growth ends at seven Gaussians
+    /// for every ten pixels of a photo, or one for every hundred of all photos that are trained on
+    /// (300 values for up to 59 parameters), whichever is more; docs/TRAINING.md has what more
+    /// would give.
     pub density: AdcSettings,
 }
 
@@ -94,8 +100,8 @@ impl Default for TrainConfig {
 }
 
 impl TrainConfig {
-    /// Reads a `config.toml`, a byte-order mark before it or not; or says in a line what is wrong with it. What it does
-    /// not name is as by default.
+    /// Reads a `config.toml`, a byte-order mark before it or not; or says in a line what is wrong
+    /// with it. What it does not name is as by default.
     ///
     /// # Errors
     /// When it is no text, no TOML, or names what is no setting.
@@ -121,7 +127,8 @@ impl TrainConfig {
         found
     }
 
-    /// The settings that `other` has otherwise, in words: `seed = 7, not 8`. Nothing if there is none.
+    /// The settings that `other` has otherwise, in words: `seed = 7, not 8`. Nothing if there is
+    /// none.
     pub fn difference_in_words(&self, other: &Self) -> Option<String> {
         let differences = self.differences(other);
         let words = differences
@@ -250,8 +257,8 @@ impl TrainConfig {
         }
     }
 
-    /// Refuses opacities that gradients could not bring back: below the cut nothing is drawn and nothing learns, and what
-    /// a reset leaves below the opacity of pruning is removed.
+    /// Refuses opacities that gradients could not bring back: below the cut nothing is drawn and
+    /// nothing learns, and what a reset leaves below the opacity of pruning is removed.
     fn check_reachable_opacities(&self) -> Result<(), String> {
         let cut = RasterizeSettings::default().alpha_min;
         let starts = [

@@ -5,7 +5,8 @@ use serde::{Deserialize, Serialize};
 
 use splat_data::{Capture, View};
 
-/// What tells one capture from another: of each view name, size, camera, use and photo; the number of points.
+/// What tells one capture from another: of each view name, size, camera, use and photo; the number
+/// of points.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Fingerprint {
     /// Name of its folder, for words only: folders are moved.
@@ -59,8 +60,8 @@ impl Fingerprint {
         &self.name
     }
 
-    /// The first thing that makes `given` another capture than this one, in words. Photos whose pixels alone differ do
-    /// not: see [`changed_photos`](Self::changed_photos).
+    /// The first thing that makes `given` another capture than this one, in words. Photos whose
+    /// pixels alone differ do not: see [`changed_photos`](Self::changed_photos).
     pub(super) fn difference(&self, given: &Self) -> Option<String> {
         let named = |print: &Self, name: &str| print.views.iter().any(|view| view.name == name);
         let missing = |from: &Self, of: &Self| {

@@ -5,8 +5,8 @@ use splat_model::{InitSettings, splats_from_points};
 
 use super::TrainError;
 
-/// How many Gaussians are worth their time where no setting says it: seven for every ten pixels of a photo, or one for
-/// every hundred of all photos that are trained on, whichever is more.
+/// How many Gaussians are worth their time where no setting says it: seven for every ten pixels of
+/// a photo, or one for every hundred of all photos that are trained on, whichever is more.
 pub(super) fn default_max_gaussians(capture: &Capture) -> usize {
     let pixels = |view: &usize| {
         let view = &capture.views[*view];

@@ -1,4 +1,5 @@
-//! Modules that ride along with a run: they change cameras, backgrounds or pictures, and have optimisers of their own.
+//! Modules that ride along with a run: they change cameras, backgrounds or pictures, and have
+//! optimisers of their own.
 
 use std::any::Any;
 
@@ -28,8 +29,9 @@ pub struct HookView<'a> {
     pub purpose: Purpose,
 }
 
-/// Something that is trained beside the model: poses, exposures, a background. Every method has a default that changes
-/// nothing. Given to [`TrainerBuilder::hook`](super::TrainerBuilder::hook); asked in the order in which hooks were given.
+/// Something that is trained beside the model: poses, exposures, a background. Every method has a
+/// default that changes nothing. Given to [`TrainerBuilder::hook`](super::TrainerBuilder::hook);
+/// asked in the order in which hooks were given.
 pub trait Hook: Any + Send {
     /// What a checkpoint calls it; no two hooks of a run share a name.
     fn name(&self) -> &str;
@@ -42,7 +44,8 @@ pub trait Hook: Any + Send {
         Ok(cameras)
     }
 
-    /// The colour behind the scene, `[C, 3]`, if it is this hook's to say; the first that has one says it.
+    /// The colour behind the scene, `[C, 3]`, if it is this hook's to say; the first that has one
+    /// says it.
     ///
     /// # Errors
     /// As those of the ops that it uses.

@@ -84,8 +84,9 @@ impl LossTerms {
         self.terms([(name, weight)], term)
     }
 
-    /// Adds terms, names and weights, that one closure measures together: as one tensor of as many values, because to
-    /// cut it and put it together again is work for the device, and more of it for the gradient.
+    /// Adds terms, names and weights, that one closure measures together: as one tensor of as many
+    /// values, because to cut it and put it together again is work for the device, and more of it
+    /// for the gradient.
     pub fn terms(
         mut self,
         terms: impl IntoIterator<Item = (impl Into<String>, f64)>,
@@ -114,7 +115,8 @@ impl LossTerms {
         terms.map(|(name, _)| name.as_str())
     }
 
-    /// The weighted sum, and the terms without their weights, detached, in groups; `None` without terms.
+    /// The weighted sum, and the terms without their weights, detached, in groups; `None` without
+    /// terms.
     pub(super) fn evaluate(
         &self,
         view: &TargetView,

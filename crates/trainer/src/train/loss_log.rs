@@ -8,7 +8,8 @@ use super::{LossRecord, TrainError};
 /// Losses are read back from the device in batches of this many steps.
 pub const LOSS_BATCH: usize = 10;
 
-/// A run ends after this many steps in a row without a finite loss: no single photo is the cause then.
+/// A run ends after this many steps in a row without a finite loss: no single photo is the cause
+/// then.
 const NOT_FINITE_LIMIT: usize = 100;
 
 /// A loss on the device.

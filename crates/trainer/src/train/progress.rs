@@ -52,7 +52,8 @@ impl<M: SplatModel> Trained<M> {
         }
     }
 
-    /// The state to resume from. It is as large again as the scene, and the optimisers' moments twice that.
+    /// The state to resume from. It is as large again as the scene, and the optimisers' moments
+    /// twice that.
     ///
     /// # Errors
     /// When the device fails.

@@ -13,12 +13,12 @@ impl<M: SplatModel> Trainer<M> {
     /// Runs to the last step, or until interrupted.
     ///
     /// A gradient that is not finite never reaches the optimiser (see
-    /// [`SplatAdam`](splat_model::optimizer::SplatAdam)), so a step whose loss is not is a warning, and an error only when
-    /// many come in a row.
+    /// [`SplatAdam`](splat_model::optimizer::SplatAdam)), so a step whose loss is not is a warning,
+    /// and an error only when many come in a row.
     ///
     /// # Errors
-    /// When the loss is not finite for 100 steps in a row, or for the whole of a shorter run, or an op refuses what it is
-    /// given.
+    /// When the loss is not finite for 100 steps in a row, or for the whole of a shorter run, or an
+    /// op refuses what it is given.
     pub fn run(mut self) -> Result<Trained<M>, TrainError> {
         if self.state.step == 0 {
             let splats = self.state.model.model().to_data();
@@ -117,8 +117,8 @@ impl<M: SplatModel> Trainer<M> {
         let saved = Checkpoint::of(&self.state, &self.record)
             .and_then(|checkpoint| (autosave.save)(&checkpoint));
         autosave.last = std::time::Instant::now();
-        // Training is worth more than what could not be kept of it. Not part of the history: when the run is resumed
-        // it is news again.
+        // Training is worth more than what could not be kept of it. Not part of the history: when
+        // the run is resumed it is news again.
         if let Err(error) = saved
             && !autosave.failures.contains(&error.kind())
         {
@@ -130,8 +130,8 @@ impl<M: SplatModel> Trainer<M> {
         }
     }
 
-    /// Keeps what was done before a step that failed, if there is a place for it. A loss that is not finite is no reason
-    /// to replace a state of before it.
+    /// Keeps what was done before a step that failed, if there is a place for it. A loss that is
+    /// not finite is no reason to replace a state of before it.
     fn rescue(&mut self, error: &TrainError) {
         let diverged = matches!(error, TrainError::NotFinite { .. });
         if self.state.step > 0 && !diverged {

@@ -171,8 +171,8 @@ fn a_run_outlives_its_autosaves() {
     assert!(trained.history.warnings.is_empty());
 }
 
-/// Another run is not gone on with: another capture, other settings, another loss; photos whose pixels alone
-/// changed are named.
+/// Another run is not gone on with: another capture, other settings, another loss; photos whose
+/// pixels alone changed are named.
 #[test]
 fn a_checkpoint_is_of_one_run() {
     let first = builder()
@@ -294,8 +294,8 @@ fn a_step_that_fails_leaves_what_was_done_before_it() {
     assert_eq!(*kept.lock().unwrap(), [7]);
 }
 
-/// A photo whose loss is NaN, whose gradients are too, is passed over; nothing of it stays in the scene or in
-/// the optimiser.
+/// A photo whose loss is NaN, whose gradients are too, is passed over; nothing of it stays in the
+/// scene or in the optimiser.
 #[test]
 fn a_photo_without_a_loss_is_named_and_passed_over() {
     let bad = capture().train_views().nth(3).unwrap().name.clone();

@@ -1,4 +1,5 @@
-//! One training step: render, measure the loss, step the optimisers, let the strategy look at it all.
+//! One training step: render, measure the loss, step the optimisers, let the strategy look at it
+//! all.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -59,8 +60,8 @@ struct Measured {
 }
 
 impl<M: SplatModel> Trainer<M> {
-    /// Takes the next step of the run, for whoever drives the loop instead of [`run`](Self::run), which also
-    /// watches, measures and keeps what becomes of it.
+    /// Takes the next step of the run, for whoever drives the loop instead of [`run`](Self::run),
+    /// which also watches, measures and keeps what becomes of it.
     ///
     /// # Errors
     /// As those of [`run`](Self::run).

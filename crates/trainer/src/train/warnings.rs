@@ -1,7 +1,8 @@
-//! What looks wrong with a run: before it, in the capture and the settings, and during it, in the losses.
+//! What looks wrong with a run: before it, in the capture and the settings, and during it, in the
+//! losses.
 //!
-//! A warning stops nothing. Thresholds compare with the other cameras, photos or views, by medians, so that one bad
-//! one stands out and a scene of any size or kind does not.
+//! A warning stops nothing. Thresholds compare with the other cameras, photos or views, by medians,
+//! so that one bad one stands out and a scene of any size or kind does not.
 
 pub(super) mod capture_checks;
 pub(super) mod loss_checks;
@@ -127,8 +128,8 @@ pub enum Warning {
 }
 
 impl Warning {
-    /// What of it `known` does not say yet: a loss that is not finite is news per photo, hard views are news by
-    /// their names, everything else is news once.
+    /// What of it `known` does not say yet: a loss that is not finite is news per photo, hard views
+    /// are news by their names, everything else is news once.
     pub(super) fn beyond(mut self, known: &[Self]) -> Option<Self> {
         for other in known {
             match (&mut self, other) {
@@ -253,7 +254,8 @@ impl fmt::Display for Warning {
     }
 }
 
-/// A length in the capture's unit, whatever that is: digits that mean something, in any order of magnitude.
+/// A length in the capture's unit, whatever that is: digits that mean something, in any order of
+/// magnitude.
 struct Length(f64);
 
 impl fmt::Display for Length {

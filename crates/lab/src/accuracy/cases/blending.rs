@@ -331,7 +331,8 @@ fn all_losses(device: &Device) -> Result<Outcome, AccuracyError> {
         .demand(errors.iter().all(|e| *e <= 1e-3), "19 channels within 1e-3"))
 }
 
-/// Image of 19 feature channels, and the gradients of a quadratic loss on it to features, opacities and background.
+/// Image of 19 feature channels, and the gradients of a quadratic loss on it to features, opacities
+/// and background.
 fn features(
     scene: &Scene,
     device: &Device,
@@ -401,9 +402,9 @@ fn million_contributions() -> Vec<Scene> {
 }
 
 fn too_many_pairs(device: &Device) -> Result<Outcome, AccuracyError> {
-    // Every splat covers all 65,536 tiles: 4.3e9 pairs, more than 32 bits count; on a CubeCL device, whose backward keeps
-    // up to 22 values per pair, 2.6e8 are too many (Mesa's software device, which ends any loop after 65,535 rounds, finds
-    // a few fewer).
+    // Every splat covers all 65,536 tiles: 4.3e9 pairs, more than 32 bits count; on a CubeCL
+    // device, whose backward keeps up to 22 values per pair, 2.6e8 are too many (Mesa's software
+    // device, which ends any loop after 65,535 rounds, finds a few fewer).
     let side = 4096;
     let n = match *device == Device::flex() {
         true => 65_600,

@@ -79,7 +79,8 @@ fn near_plane() -> Vec<Scene> {
 }
 
 fn at_the_clamp() -> Vec<Scene> {
-    // Margin and focal length are powers of two: x/z = (16 + 4)/32 is exact, and so are its neighbours.
+    // Margin and focal length are powers of two: x/z = (16 + 4)/32 is exact, and so are its
+    // neighbours.
     vec![clear(1e-5, |seed| {
         let mut sketch = Sketch::new("at the clamp", 32, 32, seed);
         sketch.project.clamp_margin = 0.125;
@@ -144,8 +145,9 @@ fn wide() -> Vec<Scene> {
     })]
 }
 
-/// A scene far away, once in double precision at its place in the world, once in single precision from an origin.
-/// The pose gradient of the first is carried to the origin: that of W loses t's times the origin.
+/// A scene far away, once in double precision at its place in the world, once in single precision
+/// from an origin. The pose gradient of the first is carried to the origin: that of W loses t's
+/// times the origin.
 fn map_coordinates(device: &Device) -> Result<Outcome, AccuracyError> {
     let mut outcome = Outcome::new();
     for offset in [1e5, 1e6, 1e7] {
@@ -155,7 +157,8 @@ fn map_coordinates(device: &Device) -> Result<Outcome, AccuracyError> {
             sketch.scatter(16, (0.3, 0.8));
             sketch.scene()
         });
-        // A rotation that is one to single precision only would turn the origin's distance into an error of the scene.
+        // A rotation that is one to single precision only would turn the origin's distance into an
+        // error of the scene.
         let mut local = local;
         local.inputs.viewmat.values = orthonormal(&local.inputs.viewmat.values);
         let mut world = local.clone();
@@ -186,8 +189,8 @@ fn map_coordinates(device: &Device) -> Result<Outcome, AccuracyError> {
     Ok(outcome.note("1e5, 1e6, 1e7"))
 }
 
-/// Leaves of the gradient [dW | dt] what a rigid motion sees: the skew part of W^T dW, and dt. The rest would make W no
-/// rotation any more; there, the two places of the scene differ by definition.
+/// Leaves of the gradient [dW | dt] what a rigid motion sees: the skew part of W^T dW, and dt. The
+/// rest would make W no rotation any more; there, the two places of the scene differ by definition.
 fn pose_gradient(viewmat: &[f64], gradient: &mut Array) {
     let rows = |values: &[f64]| [0, 1, 2].map(|i| DVec3::from_slice(&values[4 * i..4 * i + 3]));
     let (w, dw) = (rows(viewmat), rows(&gradient.values));

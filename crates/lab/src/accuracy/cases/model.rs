@@ -94,8 +94,8 @@ fn opacity_logits(device: &Device) -> Result<Outcome, AccuracyError> {
     let loss = weigh(rendered.image(), &upstream.image) + weigh(rendered.alpha(), &upstream.alpha);
     let gradient = gaussians.opacity_logits.val().grad(&loss.backward());
     let gradient = read(gradient.ok_or_else(|| AccuracyError::Read("no gradient".into()))?)?;
-    // Of every logit for itself: the extreme ones would drown in the others' norm. Those below the smallest normal float
-    // can only be about zero.
+    // Of every logit for itself: the extreme ones would drown in the others' norm. Those below the
+    // smallest normal float can only be about zero.
     let error = |i: usize| match expected[i].abs() < f64::from(f32::MIN_POSITIVE) {
         true => gradient[i].abs().min(1.0),
         false => relative_l2(&gradient[i..=i], &expected[i..=i]),
@@ -250,7 +250,8 @@ fn ssim_patches(device: &Device) -> Result<Outcome, AccuracyError> {
         let [loss, gradient] = measure([image, target], device, DType::F32)?;
         let [exact_loss, exact] = measure([image, target], &Device::flex(), DType::F64)?;
         outcome.forward = outcome.forward.max(relative_l2(&loss, &exact_loss));
-        // At its maximum SSIM has no gradient; what is left is measured against that of a visible difference.
+        // At its maximum SSIM has no gradient; what is left is measured against that of a visible
+        // difference.
         let largest = exact.iter().fold(0.0f64, |m, g| m.max(g.abs()));
         if largest > 1e-12 {
             outcome.gradient = outcome.gradient.max(relative_l2(&gradient, &exact));

@@ -94,7 +94,8 @@ fn pancake() -> Vec<Scene> {
     vec![clear(1e-4, |seed| {
         let mut sketch = Sketch::new("pancakes edge-on", 64, 64, seed);
         for i in 0..3 {
-            // Thin along the camera's x, so that one looks along the disc; then turned about the camera's axis.
+            // Thin along the camera's x, so that one looks along the disc; then turned about the
+            // camera's axis.
             let pixel = [32.0 + 2.0 * f64::from(i), 32.0];
             let blob = sketch.splat(pixel, 2.0, [1.0; 3], about_z(0.3 * f64::from(i)), 0.9);
             blob.scale = [1e-5, 1.0, 1.0];
@@ -232,7 +233,8 @@ fn needle_outside() -> Vec<Scene> {
 }
 
 fn relocation(_: &Device) -> Result<Outcome, AccuracyError> {
-    // 51 copies of an opaque Gaussian, from the series of the paper in decimal arithmetic of 90 digits.
+    // 51 copies of an opaque Gaussian, from the series of the paper in decimal arithmetic of 90
+    // digits.
     let (opacity, factor) = splat_model::strategy::relocate(1.0, 51);
     let error = (factor / 0.420_778_371_403_541_15 - 1.0).abs();
     let finite = [0.0, 1e-300, 0.5, 1.0 - 1e-16, 1.0].iter().all(|o| {

@@ -43,7 +43,8 @@ fn double(scene: &Scene) -> crate::gradcheck::Computed {
     run(scene, &Device::flex(), Precision::F64, None).unwrap()
 }
 
-/// The fixture of a scene by our own double precision, and whether single precision fails it with every pixel counted.
+/// The fixture of a scene by our own double precision, and whether single precision fails it with
+/// every pixel counted.
 fn judged_whole(scene: Scene) -> (Fixture, bool) {
     let reference = double(&scene);
     let fixture = Fixture {
@@ -58,7 +59,8 @@ fn judged_whole(scene: Scene) -> (Fixture, bool) {
     (fixture, !report.pass)
 }
 
-/// The last splat's alpha at the pixel in double precision, were its opacity 1, and the transmittance before it.
+/// The last splat's alpha at the pixel in double precision, were its opacity 1, and the
+/// transmittance before it.
 fn at_pixel(scene: &Scene) -> (f64, f64) {
     let computed = double(scene);
     let falloffs = computed.projected.values.chunks_exact(9).map(|row| {
@@ -111,8 +113,8 @@ fn checked(fixture: &Fixture, bug: Option<Bug>) -> FileReport {
     check(fixture, &Device::flex(), bug).unwrap()
 }
 
-/// Far from the principal point, where a screen mean is the difference of large numbers, single precision decides several
-/// pixels differently. A splat more or less shows in the picture.
+/// Far from the principal point, where a screen mean is the difference of large numbers, single
+/// precision decides several pixels differently. A splat more or less shows in the picture.
 #[test]
 fn every_pixel_that_single_precision_decides_differently_is_near() {
     let (mut flipped, mut near, mut pixels) = (0, 0, 0);
@@ -179,7 +181,8 @@ fn more_than_a_hundredth_of_the_pixels_on_a_threshold_fails() {
     }
 }
 
-/// Leaving pixels out must not excuse anything: the file is judged in double precision with all of them.
+/// Leaving pixels out must not excuse anything: the file is judged in double precision with all of
+/// them.
 #[test]
 fn a_wrong_file_with_a_pixel_on_a_threshold_fails() {
     let fixture = on_threshold(On::Cut, 24);

@@ -20,8 +20,8 @@ pub(super) fn pixels(point: &Point) -> f64 {
     point.work.pixels
 }
 
-/// The greatest exponent of step time in `size` between neighbouring points that differ in nothing else; `None` where
-/// no two are such.
+/// The greatest exponent of step time in `size` between neighbouring points that differ in nothing
+/// else; `None` where no two are such.
 pub fn steepest(points: &[Point], size: fn(&Point) -> f64) -> Option<f64> {
     let same_else = |a: &Point, b: &Point| {
         let same = |of: fn(&Point) -> f64| of(a) == of(b);
@@ -40,8 +40,8 @@ pub fn steepest(points: &[Point], size: fn(&Point) -> f64) -> Option<f64> {
     steepest
 }
 
-/// Peak memory as `constant + a Gaussians + b instances + c pixels`, by least squares of the relative error, none of them
-/// negative.
+/// Peak memory as `constant + a Gaussians + b instances + c pixels`, by least squares of the
+/// relative error, none of them negative.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct MemoryFit {
     /// Bytes that are always there.
@@ -57,7 +57,8 @@ pub struct MemoryFit {
 }
 
 impl MemoryFit {
-    /// `None` with no more points than terms, with points that do not tell the terms apart, or without memory figures.
+    /// `None` with no more points than terms, with points that do not tell the terms apart, or
+    /// without memory figures.
     pub fn of(points: &[Point]) -> Option<Self> {
         let rows: Vec<Row> = points
             .iter()
@@ -105,10 +106,11 @@ fn squared_error(rows: &[Row], factors: &[f64; TERMS]) -> f64 {
     errors(rows, factors).map(|error| error * error).sum()
 }
 
-/// The factors of the terms whose bits are set in `chosen`, zero for the others; `None` where the rows do not say.
+/// The factors of the terms whose bits are set in `chosen`, zero for the others; `None` where the
+/// rows do not say.
 fn least_squares(rows: &[Row], chosen: usize) -> Option<[f64; TERMS]> {
-    // Normal equations of rows that are divided by their bytes, so that every one asks for 1. Terms that are left out
-    // have the equation `factor = 0`.
+    // Normal equations of rows that are divided by their bytes, so that every one asks for 1. Terms
+    // that are left out have the equation `factor = 0`.
     let mut system = [[0.0; TERMS + 1]; TERMS];
     let is_chosen = |term: usize| chosen & 1 << term != 0;
     for i in 0..TERMS {
@@ -126,8 +128,8 @@ fn least_squares(rows: &[Row], chosen: usize) -> Option<[f64; TERMS]> {
     solve(system)
 }
 
-/// Gauss-Jordan elimination with pivots from the diagonal, which a symmetric positive matrix has; `None` where it is
-/// singular or nearly so.
+/// Gauss-Jordan elimination with pivots from the diagonal, which a symmetric positive matrix has;
+/// `None` where it is singular or nearly so.
 fn solve(mut system: [[f64; TERMS + 1]; TERMS]) -> Option<[f64; TERMS]> {
     let diagonal: [f64; TERMS] = core::array::from_fn(|i| system[i][i]);
     for k in 0..TERMS {
@@ -204,7 +206,8 @@ mod tests {
         assert_eq!(MemoryFit::of(&points[..4]), None);
         let same = [0; 5].map(|_| points[0].clone());
         assert_eq!(MemoryFit::of(&same), None);
-        // Instances take nothing here, and their count is off: no term may pay for it with bytes below zero.
+        // Instances take nothing here, and their count is off: no term may pay for it with bytes
+        // below zero.
         let off = points.clone().map(|point| {
             let bytes = 5e7 + 900.0 * gaussians(&point) - 9.0 * point.work.instances;
             Point {

@@ -28,11 +28,12 @@ pub const GAUSSIANS: [usize; 3] = [10_000, 100_000, 1_000_000];
 pub const PIXELS: [usize; 3] = [100_000, 500_000, 2_000_000];
 /// Steps before the clock starts, of which the fourth is the first at degree 3.
 const WARM_UP: usize = 4;
-/// Steps measured at a point: the most where Gaussians and pixels together are no more than `STEP_WORK`, fewer in
-/// proportion where they are more.
+/// Steps measured at a point: the most where Gaussians and pixels together are no more than
+/// `STEP_WORK`, fewer in proportion where they are more.
 const STEPS: core::ops::RangeInclusive<usize> = 3..=20;
 const STEP_WORK: usize = 300_000;
-/// Seconds for each way of measuring the steps of a point on a CubeCL device, as far as three steps do.
+/// Seconds for each way of measuring the steps of a point on a CubeCL device, as far as three steps
+/// do.
 const DEVICE_SECONDS: f64 = 5.0;
 
 /// All points.
@@ -44,14 +45,16 @@ pub struct ScalingReport {
     pub device: Option<Vec<(&'static str, String)>>,
     /// Points in the order they were measured.
     pub points: Vec<Point>,
-    /// Memory as a sum over what there is; absent where the system does not say, or too few points were measured.
+    /// Memory as a sum over what there is; absent where the system does not say, or too few points
+    /// were measured.
     pub memory: Option<MemoryFit>,
 }
 
 /// So many Gaussians and pixels.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Point {
-    /// The work of a view; its counts of Gaussians and pixels are what was asked for, as nearly as images go.
+    /// The work of a view; its counts of Gaussians and pixels are what was asked for, as nearly as
+    /// images go.
     pub work: Work,
     /// Threads.
     pub threads: usize,

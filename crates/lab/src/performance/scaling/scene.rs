@@ -20,7 +20,8 @@ const MARGIN: f64 = 1.1;
 /// Distance of the cameras from their middle along each axis.
 const STEP: f64 = 0.05;
 
-/// Size of the photos. In words either a number of pixels, 4 wide to 3 high, or width and height as 1920x1080.
+/// Size of the photos. In words either a number of pixels, 4 wide to 3 high, or width and height as
+/// 1920x1080.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PhotoSize {
     /// Pixels in a row.
@@ -83,10 +84,12 @@ impl FromStr for PhotoSize {
     }
 }
 
-/// Points at random on sheets across the view, as dense on the screen in each, and four cameras before them.
+/// Points at random on sheets across the view, as dense on the screen in each, and four cameras
+/// before them.
 ///
-/// A Gaussian's first size is the distance to its neighbours, so a pixel has about as many Gaussians, some 13 for each
-/// sheet, however many there are in all; until they become smaller than a pixel and the low-pass filter keeps them there.
+/// A Gaussian's first size is the distance to its neighbours, so a pixel has about as many
+/// Gaussians, some 13 for each sheet, however many there are in all; until they become smaller than
+/// a pixel and the low-pass filter keeps them there.
 pub fn synthetic_capture(gaussians: usize, size: PhotoSize) -> Capture {
     let PhotoSize { width, height } = size;
     let views = (0..VIEWS).map(|index| view(index, width, height)).collect();

@@ -1,4 +1,5 @@
-//! What the text readers promise: each line is taken for what it is, however a program or an editor left it.
+//! What the text readers promise: each line is taken for what it is, however a program or an editor
+//! left it.
 
 use super::*;
 

@@ -6,12 +6,14 @@ use std::path::{Path, PathBuf};
 use super::super::sparse_model::SparseModel;
 use super::super::{CaptureError, CaptureWarning};
 
-/// Endings of the files that are photos: what structure from motion reads, not only what is read here.
+/// Endings of the files that are photos: what structure from motion reads, not only what is read
+/// here.
 const PHOTO_ENDINGS: [&str; 9] = [
     "jpg", "jpeg", "jpe", "png", "tif", "tiff", "bmp", "webp", "heic",
 ];
 
-/// The folder `given`, in the capture `root` or absolute; without one `images/`, or the capture itself if there is none.
+/// The folder `given`, in the capture `root` or absolute; without one `images/`, or the capture
+/// itself if there is none.
 pub(super) fn of_photos(
     root: &Path,
     given: Option<&Path>,
@@ -32,8 +34,8 @@ pub(super) fn of_photos(
     })
 }
 
-/// The folder of the capture, relative to it, that holds most photos of the model, and how many; nothing if that is `used`,
-/// which does not hold all.
+/// The folder of the capture, relative to it, that holds most photos of the model, and how many;
+/// nothing if that is `used`, which does not hold all.
 pub(super) fn elsewhere(root: &Path, used: &Path, model: &SparseModel) -> Option<(PathBuf, usize)> {
     let held = |folder: &Path| {
         let there = |name: &str| folder.join(name).is_file();
@@ -60,8 +62,9 @@ pub(super) fn elsewhere(root: &Path, used: &Path, model: &SparseModel) -> Option
     most
 }
 
-/// Photos that the model does not name, in the folders where its photos lie. If those are in sub-folders (`cam1/0001.png`),
-/// all sub-folders are searched, for a whole camera may be missing; otherwise none is: masks or smaller copies lie there.
+/// Photos that the model does not name, in the folders where its photos lie. If those are in
+/// sub-folders (`cam1/0001.png`), all sub-folders are searched, for a whole camera may be missing;
+/// otherwise none is: masks or smaller copies lie there.
 pub(super) fn unregistered(
     root: &Path,
     folder: &Path,

@@ -9,12 +9,13 @@ pub(super) enum Broken {
     Corrupt,
 }
 
-/// A Huffman table (ITU T.81, annex C): the code that the next 16 bits begin with, as length * 256 + symbol; 0 where there
-/// is none.
+/// A Huffman table (ITU T.81, annex C): the code that the next 16 bits begin with, as length * 256
+/// + symbol; 0 where there is none.
 pub(super) struct Huffman(Vec<u16>);
 
 impl Huffman {
-    /// The table with `counts[i]` codes of `i + 1` bits, or nothing where there are more codes than fit.
+    /// The table with `counts[i]` codes of `i + 1` bits, or nothing where there are more codes than
+    /// fit.
     pub fn new(counts: &[u8; 16], symbols: &[u8]) -> Option<Self> {
         let mut lookup = vec![0; 1 << 16];
         let mut symbols = symbols.iter();

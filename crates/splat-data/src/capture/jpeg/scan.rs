@@ -27,8 +27,8 @@ pub(super) struct Component {
     pub down: usize,
     /// Lowest bit of every coefficient that was sent.
     pub sent: [u8; BLOCK],
-    /// Which coefficients of every block are not 0, in zigzag order from bit 0; progressive pictures only, whose later scans
-    /// depend on it. Blocks that fill an MCU have their place too.
+    /// Which coefficients of every block are not 0, in zigzag order from bit 0; progressive
+    /// pictures only, whose later scans depend on it. Blocks that fill an MCU have their place too.
     pub nonzero: Vec<u64>,
 }
 
@@ -40,7 +40,8 @@ pub(super) struct Member<'a> {
     pub ac: Option<&'a Huffman>,
 }
 
-/// What a scan sends: coefficients `first..=last` down to the bit `low`, `high` being the lowest bit sent before, or 0.
+/// What a scan sends: coefficients `first..=last` down to the bit `low`, `high` being the lowest
+/// bit sent before, or 0.
 pub(super) struct Scan<'a> {
     pub members: Vec<Member<'a>>,
     pub first: usize,
@@ -169,7 +170,8 @@ impl Walk<'_> {
         Ok(())
     }
 
-    /// One more bit of coefficients (T.81, G.1.2.3): of each that is not 0 already, and the sign of each that becomes so.
+    /// One more bit of coefficients (T.81, G.1.2.3): of each that is not 0 already, and the sign of
+    /// each that becomes so.
     fn refine_ac(
         &mut self,
         member: &Member<'_>,

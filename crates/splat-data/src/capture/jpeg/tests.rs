@@ -1,4 +1,5 @@
-//! What the check promises: nothing that a decoder makes up passes, and nothing that is whole is refused.
+//! What the check promises: nothing that a decoder makes up passes, and nothing that is whole is
+//! refused.
 //!
 //! The files are one synthetic picture, written by libjpeg-turbo.
 
@@ -131,7 +132,8 @@ fn a_hole_is_noticed() {
             unnoticed += usize::from(unseen);
         }
     }
-    // JPEG has no checksum, and zeros are data too: the walk may come back into step. Measured: 16 of 600.
+    // JPEG has no checksum, and zeros are data too: the walk may come back into step. Measured: 16
+    // of 600.
     assert!(unnoticed * 20 <= holes, "{unnoticed} of {holes} holes");
 }
 

@@ -99,8 +99,8 @@ impl Columns {
         }
     }
 
-    /// Appends the row's Gaussian to `scene`; or returns the first column, in the order of the fields, whose value means
-    /// nothing (see [`may_be`]).
+    /// Appends the row's Gaussian to `scene`; or returns the first column, in the order of the
+    /// fields, whose value means nothing (see [`may_be`]).
     pub(super) fn take(&self, row: &Row, scene: &mut SplatData) -> Result<(), usize> {
         let value = |column: usize| {
             let value = row.values[column];
@@ -137,8 +137,9 @@ impl Columns {
     }
 }
 
-/// Whether a property may have this value. Infinity is one where it means something: opacity logits of plus and minus
-/// infinity are opacities of 1 and 0, and a log-scale of minus infinity is a flat Gaussian.
+/// Whether a property may have this value. Infinity is one where it means something: opacity logits
+/// of plus and minus infinity are opacities of 1 and 0, and a log-scale of minus infinity is a flat
+/// Gaussian.
 pub(super) fn may_be(property: &str, value: f32) -> bool {
     match property {
         "opacity" => !value.is_nan(),

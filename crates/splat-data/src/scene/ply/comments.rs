@@ -1,4 +1,5 @@
-//! What the comments of a PLY header say about a scene: where its means count from, and how it must be rendered.
+//! What the comments of a PLY header say about a scene: where its means count from, and how it must
+//! be rendered.
 //!
 //! ```text
 //! comment burn-splat origin X Y Z
@@ -7,12 +8,14 @@
 //! comment burn-splat background R G B
 //! ```
 //!
-//! Comments are prose, so what is ours begins with a word that nothing else begins with, and anything else is passed
-//! over. Exceptions are tags that others use, `SplatRenderMode: default|mip|2dgs` and `antialiased 0|1`, which are written
-//! too, and `origin X Y Z` with three finite numbers, the form of earlier versions.
+//! Comments are prose, so what is ours begins with a word that nothing else begins with, and
+//! anything else is passed over. Exceptions are tags that others use, `SplatRenderMode:
+//! default|mip|2dgs` and `antialiased 0|1`, which are written too, and `origin X Y Z` with three
+//! finite numbers, the form of earlier versions.
 //!
-//! What begins with our word and names a setting must be readable: to guess would be to render something else. A setting
-//! with a name that we do not know (of a later version, perhaps) is told by [`SceneSettings::not_understood`].
+//! What begins with our word and names a setting must be readable: to guess would be to render
+//! something else. A setting with a name that we do not know (of a later version, perhaps) is told
+//! by [`SceneSettings::not_understood`].
 
 use std::path::Path;
 use std::str::FromStr;

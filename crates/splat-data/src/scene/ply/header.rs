@@ -1,7 +1,8 @@
 //! The header of a PLY file, made plain before it is parsed.
 //!
-//! Headers come from many programs and text editors. A byte-order mark before `ply`, blank lines, indentation, carriage
-//! returns before line feeds, comments before `format`, and comments in another encoding than UTF-8 change nothing.
+//! Headers come from many programs and text editors. A byte-order mark before `ply`, blank lines,
+//! indentation, carriage returns before line feeds, comments before `format`, and comments in
+//! another encoding than UTF-8 change nothing.
 
 use std::io::{BufRead, Read};
 use std::path::Path;

@@ -2,8 +2,8 @@
 
 use std::collections::HashSet;
 
-/// The first line that repeats the name of an element, or that of a property of its element. The library would keep one
-/// of the two, and read every value behind it from the wrong place.
+/// The first line that repeats the name of an element, or that of a property of its element. The
+/// library would keep one of the two, and read every value behind it from the wrong place.
 pub(super) fn repetition(header: &str) -> Option<&str> {
     let (mut elements, mut properties) = (HashSet::new(), HashSet::new());
     for line in header.lines() {

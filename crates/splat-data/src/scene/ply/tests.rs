@@ -34,7 +34,8 @@ fn file_in(folder: &TempDir) -> PathBuf {
     folder.path().join("scene.ply")
 }
 
-/// Writes `bytes` as a file and returns the message of reading it, which must name the file in one line.
+/// Writes `bytes` as a file and returns the message of reading it, which must name the file in one
+/// line.
 fn error_of(bytes: &[u8]) -> SceneFileError {
     let folder = TempDir::new().unwrap();
     let path = file_in(&folder);
@@ -519,7 +520,8 @@ fn headers_that_announce_too_much_end_soon() {
     assert_eq!(read_bytes(&padded).unwrap(), scene(1, 0));
 }
 
-/// Of two properties of one name the library keeps one, and reads every value behind it from the wrong place.
+/// Of two properties of one name the library keeps one, and reads every value behind it from the
+/// wrong place.
 #[test]
 fn a_name_that_occurs_twice_is_refused_whatever_it_names() {
     let text = ascii(&scene(2, 0), "float");

@@ -14,7 +14,8 @@ use crate::cpu::uninit::{Part, Uncleared};
 /// Parts that the counting sort is done in, at most: each counts the tiles for itself.
 const PARTS: usize = 16;
 
-/// The emitted intersections brought together tile by tile, in the order in which they were emitted.
+/// The emitted intersections brought together tile by tile, in the order in which they were
+/// emitted.
 pub(super) struct ByTile {
     /// By emitted intersection: its splat.
     owners: Vec<u32>,
@@ -87,8 +88,8 @@ impl ByTile {
         }
     }
 
-    /// The lists of the given Gaussians: each tile's intersections front to back, and in the order of the Gaussians
-    /// where their splats are equally deep.
+    /// The lists of the given Gaussians: each tile's intersections front to back, and in the order
+    /// of the Gaussians where their splats are equally deep.
     pub(super) fn sorted<T: Real>(self, listed: Vec<u32>, depths: &[T]) -> TileLists {
         let count = self.intersections.len();
         let mut splats = Uncleared::<u32>::new(count);
@@ -165,7 +166,8 @@ impl Piece<'_> {
     }
 }
 
-/// Memory that several threads write, each its own places. Every place is written before any is read.
+/// Memory that several threads write, each its own places. Every place is written before any is
+/// read.
 fn unset(len: usize) -> Vec<AtomicU32> {
     let values = overwritten::<u32>(len).into_iter();
     values.map(AtomicU32::new).collect()

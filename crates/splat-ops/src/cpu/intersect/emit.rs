@@ -1,7 +1,8 @@
 //! The splats of a view, and the tiles that each of them reaches.
 //!
-//! Splats are worked on side by side, as SIMD code. What depends on a splat, how many rows of tiles it reaches and how many
-//! tiles in each, is no branch wherever it can be avoided: it would be guessed wrongly as often as not.
+//! Splats are worked on side by side, as SIMD code. What depends on a splat, how many rows of tiles
+//! it reaches and how many tiles in each, is no branch wherever it can be avoided: it would be
+//! guessed wrongly as often as not.
 
 use super::super::real::Real;
 use super::super::simd::{LANES, Lanes, vectorized};
@@ -196,13 +197,15 @@ fn write_run(start: i32, length: i32, tiles: &mut Vec<u32>) {
     }
 }
 
-/// The first row of tiles that an ellipse of this height reaches, and the one after the last, with half a pixel of slack.
+/// The first row of tiles that an ellipse of this height reaches, and the one after the last, with
+/// half a pixel of slack.
 #[inline(always)]
 fn rows_of_tiles<T: Real>(mean: T, half: T, grid: Grid) -> [i32; 2] {
     tiles_between([mean - half, mean + half], T::of(0.5), grid.rows)
 }
 
-/// The first tile of a row whose box of pixel centres the ellipse touches, and the one after the last.
+/// The first tile of a row whose box of pixel centres the ellipse touches, and the one after the
+/// last.
 #[inline(always)]
 fn tiles_of_row<T: Real>(splat: &Splat<T>, row: i32, grid: Grid) -> [i32; 2] {
     let top = T::of_index(row * TILE as i32) + T::of(0.5) - splat.mean[1];
@@ -216,9 +219,11 @@ fn tiles_of_row<T: Real>(splat: &Splat<T>, row: i32, grid: Grid) -> [i32; 2] {
     [start + first, start + after]
 }
 
-/// The first tile that an interval reaches, given some slack, and the one after the last, of `count` in a row or column.
-// In this precision and without a branch: in f64, and with casts that saturate, it takes most of the time of the lists. The
-// nearest integer to a half more is the next one; a ten-thousandth stands for ties.
+/// The first tile that an interval reaches, given some slack, and the one after the last, of
+/// `count` in a row or column.
+// In this precision and without a branch: in f64, and with casts that saturate, it takes most of
+// the time of the lists. The nearest integer to a half more is the next one; a ten-thousandth
+// stands for ties.
 #[inline(always)]
 fn tiles_between<T: Real>([low, high]: [T; 2], slack: T, count: usize) -> [i32; 2] {
     let (half, tie, count) = (T::of(0.5), T::of(1e-4), T::of(count as f64));
@@ -237,8 +242,9 @@ mod tests {
     use crate::ImageSize;
     use rand::{RngExt, SeedableRng};
 
-    /// Against brute force over every pixel: no tile that holds a visible pixel may be missing, and a tile without one may
-    /// only be listed if its box of pixel centres is touched between the centres.
+    /// Against brute force over every pixel: no tile that holds a visible pixel may be missing, and
+    /// a tile without one may only be listed if its box of pixel centres is touched between the
+    /// centres.
     #[test]
     fn the_tiles_agree_with_brute_force_over_pixels() {
         const SIZE: [usize; 2] = [83, 141];

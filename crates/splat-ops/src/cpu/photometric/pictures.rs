@@ -1,5 +1,5 @@
-//! The two pictures in memory: what was rendered, whose pixels have more channels than count, and the target, in 8 bits
-//! or as it is.
+//! The two pictures in memory: what was rendered, whose pixels have more channels than count, and
+//! the target, in 8 bits or as it is.
 
 use core::ops::Range;
 

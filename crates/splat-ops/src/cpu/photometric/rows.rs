@@ -1,5 +1,5 @@
-//! Arithmetic on rows, in blocks of [`LANES`] values. Rows are [`padded`]: the last block of a range may reach over its
-//! end, where nothing is read that matters.
+//! Arithmetic on rows, in blocks of [`LANES`] values. Rows are [`padded`]: the last block of a
+//! range may reach over its end, where nothing is read that matters.
 
 use core::ops::Range;
 
@@ -9,7 +9,8 @@ use crate::cpu::simd::vectorized;
 
 /// Values that are summed at once along a row.
 const LANES: usize = 16;
-/// Moments of each of two rows that are summed at once: the sums of all four have to fit a processor's registers.
+/// Moments of each of two rows that are summed at once: the sums of all four have to fit a
+/// processor's registers.
 const PAIR: usize = LANES / 2;
 
 /// The length of a row in memory that holds `values`: whole blocks, and one beyond.
@@ -39,8 +40,9 @@ fn add<T: Real, const FMA: bool, const L: usize, const N: usize>(
     }
 }
 
-/// Two rows of N values, one below the other, blurred down the columns: `rows` are those under the window of either, in
-/// which `values` finds a block. Two at once, as there is less to compute than to fetch.
+/// Two rows of N values, one below the other, blurred down the columns: `rows` are those under the
+/// window of either, in which `values` finds a block. Two at once, as there is less to compute than
+/// to fetch.
 #[inline(always)]
 fn blur_down<T: Real, Row, const FMA: bool, const L: usize, const N: usize>(
     rows: &[Row],
@@ -138,7 +140,8 @@ vectorized! {
 }
 
 vectorized! {
-    /// Two rows of moments blurred down the columns, from the rows of x and y under the window of either.
+    /// Two rows of moments blurred down the columns, from the rows of x and y under the window of
+    /// either.
     pub(super) fn moments_down<T: Real, const FMA: bool>(
         rows: &[[&[T]; 2]],
         window: &[T],
@@ -164,8 +167,8 @@ vectorized! {
 }
 
 vectorized! {
-    /// The fields and the similarity at `range`, from rows of moments that are blurred down the columns, by blurring
-    /// them along the row too. Beside the range the fields are zero.
+    /// The fields and the similarity at `range`, from rows of moments that are blurred down the
+    /// columns, by blurring them along the row too. Beside the range the fields are zero.
     pub(super) fn fields_along<T: Real, const FMA: bool>(
         moments: [&[T]; MOMENTS],
         range: Range<usize>,
@@ -208,7 +211,8 @@ vectorized! {
 }
 
 vectorized! {
-    /// `scale (f0 + x f1 + y f2)` at `range`, f being fields that are blurred down the columns, blurred along the row.
+    /// `scale (f0 + x f1 + y f2)` at `range`, f being fields that are blurred down the columns,
+    /// blurred along the row.
     pub(super) fn slope_along<T: Real, const FMA: bool>(
         fields: [&[T]; FIELDS],
         pictures: [&[T]; 2],

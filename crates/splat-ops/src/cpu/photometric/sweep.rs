@@ -5,13 +5,14 @@
 //! d(sum S)/dx = blur(dS/dmx) + 2 x blur(dS/dq) + y blur(dS/dp)
 //! ```
 //!
-//! mx, my, q, p being the windowed means of x, y, x^2 + y^2, xy; outside of the pixels that count the three derivatives,
-//! the fields, are zero.
+//! mx, my, q, p being the windowed means of x, y, x^2 + y^2, xy; outside of the pixels that count
+//! the three derivatives, the fields, are zero.
 //!
-//! A band of rows is one unit of parallel work; it goes down a strip of columns at a time. What the window reaches over
-//! is kept in rings: rows of the pictures, and rows of fields. A step takes in two rows of the pictures, makes two of fields,
-//! a radius higher, and with these two of the gradient, a radius higher again. What the window reaches over beyond a band
-//! or a strip is computed by both neighbours.
+//! A band of rows is one unit of parallel work; it goes down a strip of columns at a time. What the
+//! window reaches over is kept in rings: rows of the pictures, and rows of fields. A step takes in
+//! two rows of the pictures, makes two of fields, a radius higher, and with these two of the
+//! gradient, a radius higher again. What the window reaches over beyond a band or a strip is
+//! computed by both neighbours.
 
 use core::ops::Range;
 
@@ -56,8 +57,9 @@ impl<'a, T: Real> Sweep<'a, T> {
         }
     }
 
-    /// Adds the absolute differences and the similarities of rows of an image to the `sums` of each, which has the rows from
-    /// `first` on. `slope` is the memory of these rows, for the gradient of the mean similarity.
+    /// Adds the absolute differences and the similarities of rows of an image to the `sums` of
+    /// each, which has the rows from `first` on. `slope` is the memory of these rows, for the
+    /// gradient of the mean similarity.
     pub(super) fn band(
         &self,
         image: usize,
@@ -148,8 +150,8 @@ impl<T: Real> Scratch<T> {
     }
 }
 
-/// A strip of a band. Rows in memory have two radii of pixels on either side of it: fields are needed one radius beyond
-/// it, and pictures another.
+/// A strip of a band. Rows in memory have two radii of pixels on either side of it: fields are
+/// needed one radius beyond it, and pictures another.
 struct Strip<'a, T> {
     sweep: &'a Sweep<'a, T>,
     image: usize,
@@ -224,7 +226,8 @@ impl<'a, T: Real> Strip<'a, T> {
         rows::sum_of_differences(&x[own.clone()], &y[own])
     }
 
-    /// Makes a row of fields and the next, zero where no pixel counts. The strip's sums of similarities.
+    /// Makes a row of fields and the next, zero where no pixel counts. The strip's sums of
+    /// similarities.
     fn fields(&self, row: isize, scratch: &mut Scratch<T>) -> [f64; 2] {
         let [counted, columns] = &self.sweep.counted;
         let within = self.with_margin(self.radius, columns);

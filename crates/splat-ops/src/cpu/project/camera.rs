@@ -1,4 +1,5 @@
-//! One camera: how it sees a point, and the gradient of that. Another camera model replaces this file.
+//! One camera: how it sees a point, and the gradient of that. Another camera model replaces this
+//! file.
 
 use super::super::math::*;
 use super::super::real::Real;

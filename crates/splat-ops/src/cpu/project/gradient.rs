@@ -1,4 +1,5 @@
-//! The vector-Jacobian product of the projection, for one Gaussian and one camera; without a branch, as its forward.
+//! The vector-Jacobian product of the projection, for one Gaussian and one camera; without a
+//! branch, as its forward.
 
 use super::super::math::*;
 use super::super::real::Real;
@@ -26,7 +27,8 @@ pub(super) fn splat_backward<T: Real>(
     let (e, w11, w22) = (s.e, s.w11, s.w22);
     let compensation = s.packed[6];
 
-    // Inverse Cholesky factor (packed in 1 / pixels, here in 1 / k) and compensation -> a, b, det, |m|.
+    // Inverse Cholesky factor (packed in 1 / pixels, here in 1 / k) and compensation -> a, b, det,
+    // |m|.
     let (g11, g21, g22) = (grad[3] / s.k, grad[4] / s.k, grad[5] / s.k);
     let g22 = g22 - g21 * s.b / s.a;
     let db = -g21 * w22 / s.a;

@@ -1,5 +1,5 @@
-//! One Gaussian seen by one camera: the forward formulas, without a branch, so that a loop over Gaussians becomes SIMD
-//! code.
+//! One Gaussian seen by one camera: the forward formulas, without a branch, so that a loop over
+//! Gaussians becomes SIMD code.
 
 use splat_core::SPLAT_SIZE_MAX;
 

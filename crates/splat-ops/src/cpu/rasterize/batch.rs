@@ -1,4 +1,5 @@
-//! Splats of a tile's list that are worked on together, and which of them reach each block of the tile.
+//! Splats of a tile's list that are worked on together, and which of them reach each block of the
+//! tile.
 
 use core::ops::Range;
 
@@ -7,11 +8,12 @@ use super::super::simd::prefetch;
 use super::splat::{BLOCKS, GROUP, Splat};
 use super::view::View;
 
-/// How many: so many that what is kept of each fits the first-level cache, and few enough for eight bits.
+/// How many: so many that what is kept of each fits the first-level cache, and few enough for eight
+/// bits.
 pub(super) const BATCH: usize = 128;
 
-/// Calls a method for some channels, a few at a time and of a number that the compiler knows, which unrolls its loops:
-/// `method::<S, COUNT>(first, ...)`.
+/// Calls a method for some channels, a few at a time and of a number that the compiler knows, which
+/// unrolls its loops: `method::<S, COUNT>(first, ...)`.
 macro_rules! by_groups {
     ($this:ident.$method:ident$(::<$simd:ident>)?($first:tt..$end:ident $(, $argument:expr)*)) => {{
         let mut first = $first;
@@ -51,8 +53,8 @@ impl<T: Real> Batch<T> {
         }
     }
 
-    /// Fetches the splats of a part of a list with their colours, and returns them; and begins to fetch those of the part
-    /// that comes next, which lie anywhere in memory.
+    /// Fetches the splats of a part of a list with their colours, and returns them; and begins to
+    /// fetch those of the part that comes next, which lie anywhere in memory.
     #[inline(always)]
     pub(super) fn gather(&mut self, view: &View<T>, list: &[u32], next: &[u32]) -> &[Splat<T>] {
         for (splat, index) in self.splats.iter_mut().zip(list) {
@@ -125,7 +127,8 @@ impl Places {
     }
 
     /// From the blocks of each splat of a batch, of which there are [`BATCH`] at most.
-    // Eight splats at a time and without branches, which would depend on the splats and be guessed wrongly as often as not.
+    // Eight splats at a time and without branches, which would depend on the splats and be guessed
+    // wrongly as often as not.
     #[inline(always)]
     pub(super) fn fill(&mut self, reached: &[u16]) {
         self.counts = [0; BLOCKS];
@@ -154,8 +157,8 @@ impl Places {
     }
 }
 
-/// An 8 x 8 matrix of bits, turned: bit j of byte i becomes bit i of byte j. By halves: blocks of one, two and four bits
-/// change places (Warren, Hacker's Delight, 7-3).
+/// An 8 x 8 matrix of bits, turned: bit j of byte i becomes bit i of byte j. By halves: blocks of
+/// one, two and four bits change places (Warren, Hacker's Delight, 7-3).
 #[inline(always)]
 fn transposed(rows: [u8; 8]) -> [u8; 8] {
     let mut bits = u64::from_le_bytes(rows);

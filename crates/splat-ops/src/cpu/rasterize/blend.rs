@@ -1,8 +1,9 @@
 //! Blends the splats of a tile, front to back.
 //!
-//! Block by block, and each block in three passes over the splats that reach it: distances and falloffs, which depend on
-//! nothing else; then weights and colours, one splat after the other. Each is a short loop, of which the processor has
-//! several turns under way at once. All in one, it would wait for every exponential.
+//! Block by block, and each block in three passes over the splats that reach it: distances and
+//! falloffs, which depend on nothing else; then weights and colours, one splat after the other.
+//! Each is a short loop, of which the processor has several turns under way at once. All in one, it
+//! would wait for every exponential.
 
 use core::ops::Range;
 
@@ -23,8 +24,8 @@ use super::work::Tally;
 /// The pixels of a tile while it is being blended, by block.
 pub(super) struct BlendTile<T> {
     transmittance: ByBlock<T>,
-    /// The least raw alpha that still counts: `alpha_min`, infinity once the pixel has stopped or where
-    /// there is none.
+    /// The least raw alpha that still counts: `alpha_min`, infinity once the pixel has stopped or
+    /// where there is none.
     gate: ByBlock<T>,
     /// The place of the splat before which the pixel stopped; `i32::MAX` while it has not.
     stop: ByBlock<i32>,
@@ -137,7 +138,8 @@ impl<T: Real> BlendTile<T> {
             let (z1, z2) = splat.z(&centres);
             square(z1, z2).store(&mut weights.0);
         }
-        // By themselves: the processor looks only so far ahead for other pairs to work on, and an exponential is long.
+        // By themselves: the processor looks only so far ahead for other pairs to work on, and an
+        // exponential is long.
         for weights in &mut *weights {
             let squares = Pixels::<S, T>::load(&weights.0);
             squares.exp2_neg().store(&mut weights.0);
@@ -148,9 +150,9 @@ impl<T: Real> BlendTile<T> {
         }
     }
 
-    /// Sends the light of the splats that reach a block to its pixels, the first group of its channels. The list's batch
-    /// begins at a `place`. Returns how many splats there are until all pixels of the block have stopped, and whether any
-    /// has not.
+    /// Sends the light of the splats that reach a block to its pixels, the first group of its
+    /// channels. The list's batch begins at a `place`. Returns how many splats there are until all
+    /// pixels of the block have stopped, and whether any has not.
     #[inline(always)]
     fn shine<S: Simd>(
         &mut self,
@@ -180,10 +182,11 @@ impl<T: Real> BlendTile<T> {
         }
     }
 
-    /// As far as no pixel stops; returns how many splats that are. Where there are more channels than a group, falloffs turn
-    /// into weights, the share of a pixel's light that each splat sends.
-    // Stopping is done elsewhere, once in a pixel's life, so that nothing here depends on it: transmittance and colours stay
-    // in registers.
+    /// As far as no pixel stops; returns how many splats that are. Where there are more channels
+    /// than a group, falloffs turn into weights, the share of a pixel's light that each splat
+    /// sends.
+    // Stopping is done elsewhere, once in a pixel's life, so that nothing here depends on it:
+    // transmittance and colours stay in registers.
     #[inline(always)]
     fn shine_until_stop<S: Simd, const COUNT: usize>(
         &mut self,
@@ -202,8 +205,8 @@ impl<T: Real> BlendTile<T> {
         let mut done = 0;
         let places = &self.batch.places.of(block)[splats.clone()];
         let falloffs = &mut self.weights[splats];
-        // Where one register holds a block, there are enough of them to remember what was before several splats, and to ask
-        // only behind the last of these whether a pixel stops.
+        // Where one register holds a block, there are enough of them to remember what was before
+        // several splats, and to ask only behind the last of these whether a pixel stops.
         if T::lanes::<S>() == LANES && channels <= GROUP {
             let fours = places.as_chunks::<4>().0.iter();
             for (places, falloffs) in fours.zip(falloffs.as_chunks::<4>().0) {
@@ -246,7 +249,8 @@ impl<T: Real> BlendTile<T> {
         done
     }
 
-    /// Closes the pixels of a block that stop before a splat, which has a place in the list; returns whether others are left.
+    /// Closes the pixels of a block that stop before a splat, which has a place in the list;
+    /// returns whether others are left.
     #[inline(always)]
     fn stop_pixels<S: Simd>(
         &mut self,
@@ -272,7 +276,8 @@ impl<T: Real> BlendTile<T> {
         are_left
     }
 
-    /// Adds some further channels of the colours of the first splats that reach a block, times their weights.
+    /// Adds some further channels of the colours of the first splats that reach a block, times
+    /// their weights.
     #[inline(always)]
     fn add_colors<S: Simd, const COUNT: usize>(
         &mut self,
@@ -379,7 +384,8 @@ impl<S: Simd, T: Real, const COUNT: usize> Clone for Light<S, T, COUNT> {
 impl<S: Simd, T: Real, const COUNT: usize> Copy for Light<S, T, COUNT> {}
 
 impl<S: Simd, T: Real, const COUNT: usize> Light<S, T, COUNT> {
-    /// Passes a splat that takes a share of it; returns the share of all light that the splat sends.
+    /// Passes a splat that takes a share of it; returns the share of all light that the splat
+    /// sends.
     #[inline(always)]
     fn pass(&mut self, share: Pixels<S, T>, color: &[T; GROUP]) -> Pixels<S, T> {
         let weights = share.times(self.left);

@@ -5,13 +5,14 @@
 //! g = d sigma = -raw d alpha = alpha T (B - c . grad)     (0 at the cap)
 //! ```
 //!
-//! T being the transmittance in front of the splat, and B what its pixel shows behind it, as the loss sees it, were there
-//! nothing in front: `B = background . grad - grad of alpha` behind the last splat, and `B (1 - alpha) + (c . grad) alpha` in
-//! front of each. T is found front to back, as when blending, so nothing is ever divided by one less alpha.
+//! T being the transmittance in front of the splat, and B what its pixel shows behind it, as the
+//! loss sees it, were there nothing in front: `B = background . grad - grad of alpha` behind the
+//! last splat, and `B (1 - alpha) + (c . grad) alpha` in front of each. T is found front to back,
+//! as when blending, so nothing is ever divided by one less alpha.
 //!
-//! Everything that a splat's shape needs is six sums over its pixels, of g times 1, z1, z2, z1^2, z1 z2 and z2^2. z is of
-//! the order of one wherever the splat is seen, so nothing cancels, however thin or far away it is. With dx = z1 / w11
-//! and dy = (z2 - w21 dx) / w22:
+//! Everything that a splat's shape needs is six sums over its pixels, of g times 1, z1, z2, z1^2,
+//! z1 z2 and z2^2. z is of the order of one wherever the splat is seen, so nothing cancels, however
+//! thin or far away it is. With dx = z1 / w11 and dy = (z2 - w21 dx) / w22:
 //!
 //! ```text
 //! d o   = -sum(g) / o                 d mean = -(w11 sum(g z1) + w21 sum(g z2), w22 sum(g z2))
@@ -49,7 +50,8 @@ pub(super) struct GradientTile<S: Simd, T: Real> {
     pairs: Vec<Aligned<Pairs<T>>>,
     /// c . grad of the same, of channels beyond the first group.
     toward: Vec<Aligned<Lanes<T>>>,
-    /// Sums of each splat of the batch, whose lanes are added last: the moments and the first group of channels.
+    /// Sums of each splat of the batch, whose lanes are added last: the moments and the first group
+    /// of channels.
     sums: Box<ByPlace<Sums<S, T>>>,
     /// Likewise of the further channels.
     further_sums: Vec<Vector<S, T>>,
@@ -91,8 +93,8 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
         }
     }
 
-    /// Reads the gradient of the tile's pixels, and adds its share of the background's gradient, `sum of T_final grad`, if there
-    /// is one.
+    /// Reads the gradient of the tile's pixels, and adds its share of the background's gradient,
+    /// `sum of T_final grad`, if there is one.
     #[inline(always)]
     pub(super) fn load(
         &mut self,
@@ -179,8 +181,8 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
         }
     }
 
-    /// Walks the list back to front and writes the sums of each splat over the tile, `MOMENTS + D` values. The splats
-    /// reach the blocks that the forward pass found.
+    /// Walks the list back to front and writes the sums of each splat over the tile, `MOMENTS + D`
+    /// values. The splats reach the blocks that the forward pass found.
     #[inline(always)]
     pub(super) fn walk(
         &mut self,
@@ -258,8 +260,8 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
         }
     }
 
-    /// How many splats of the batch, which begins at a place of the list, reach a block before its first pixel stopped, and
-    /// before its last one did.
+    /// How many splats of the batch, which begins at a place of the list, reach a block before its
+    /// first pixel stopped, and before its last one did.
     #[inline(always)]
     fn counts(&self, block: usize, first: i32, stop: &Lanes<i32>) -> [usize; 2] {
         let places = self.batch.places.of(block);
@@ -290,7 +292,8 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
     }
 
     /// Shares of some of the splats. `STOPS` if a pixel may have stopped before one of them.
-    // By themselves: the processor looks only so far ahead for other pairs to work on, and an exponential is long.
+    // By themselves: the processor looks only so far ahead for other pairs to work on, and an
+    // exponential is long.
     #[inline(always)]
     fn share<const STOPS: bool>(
         &mut self,
@@ -320,7 +323,8 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
         }
     }
 
-    /// Weights of the first splats that reach a block, front to back, given the transmittance in front of them.
+    /// Weights of the first splats that reach a block, front to back, given the transmittance in
+    /// front of them.
     #[inline(always)]
     fn weigh(&mut self, count: usize, before: &Lanes<T>) {
         let mut before = Pixels::<S, T>::load(before);
@@ -357,8 +361,9 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
         load_each(&self.grad[first..])
     }
 
-    /// Steps in front of the first splats that reach a block, the last one first, and adds what they get to their sums: their
-    /// moments and the first group of channels. Whether there are `MORE` channels.
+    /// Steps in front of the first splats that reach a block, the last one first, and adds what
+    /// they get to their sums: their moments and the first group of channels. Whether there are
+    /// `MORE` channels.
     #[inline(always)]
     fn step<const COUNT: usize, const MORE: bool>(
         &mut self,
@@ -450,8 +455,8 @@ mod tests {
     use super::*;
     use crate::{ImageSize, Projected, RasterizeSettings, rasterize};
 
-    /// Faint splats as wide as can be, the light of whose pixels ends in the second batch: each splat's weight is alpha times
-    /// what the ones before it leave, and nothing from there on.
+    /// Faint splats as wide as can be, the light of whose pixels ends in the second batch: each
+    /// splat's weight is alpha times what the ones before it leave, and nothing from there on.
     #[test]
     fn light_that_ends_behind_the_first_batch_ends_there_in_the_gradient_too() {
         let (count, alpha, size) = (

@@ -1,7 +1,8 @@
 //! The pixels of a block in registers.
 //!
-//! Written with SIMD types, where elsewhere loops over lanes become SIMD code: these passes are most of a training step, and
-//! the compiler's guesses at such loops change with what stands around them.
+//! Written with SIMD types, where elsewhere loops over lanes become SIMD code: these passes are
+//! most of a training step, and the compiler's guesses at such loops change with what stands around
+//! them.
 
 use macerator::{Mask, Simd, Vector};
 
@@ -9,8 +10,8 @@ use super::super::real::Real;
 use super::splat::{Aligned, LANES, Lanes, SIDE};
 
 /// Computes a value for every register that is used.
-// No closure: the compiler must put every function between the instructions and the one that is compiled for them into the
-// latter, and knows no way to be told so of closures.
+// No closure: the compiler must put every function between the instructions and the one that is
+// compiled for them into the latter, and knows no way to be told so of closures.
 macro_rules! each_register {
     ($i:ident => $value:expr) => {{
         let mut result = Registers([T::ZERO.splat(); _]);
@@ -22,14 +23,15 @@ macro_rules! each_register {
 }
 
 /// Some values of one block, side by side in as many registers as it takes.
-// An array as long as registers of one lane would make it, as its length has to be known; the compiler drops what is not used.
+// An array as long as registers of one lane would make it, as its length has to be known; the
+// compiler drops what is not used.
 pub(super) struct Registers<S: Simd, T: Real, const VALUES: usize>([Vector<S, T>; VALUES]);
 
 /// One value per pixel of a block.
 pub(super) type Pixels<S, T> = Registers<S, T, LANES>;
 
-/// One value per column of a block: in one register, or more where they are narrower than a row. A wider one holds it once
-/// for every row.
+/// One value per column of a block: in one register, or more where they are narrower than a row. A
+/// wider one holds it once for every row.
 pub(super) type Columns<S, T> = Registers<S, T, SIDE>;
 
 impl<S: Simd, T: Real, const VALUES: usize> Clone for Registers<S, T, VALUES> {
@@ -114,7 +116,8 @@ impl<S: Simd, T: Real> Pixels<S, T> {
     /// `c - self b`, likewise.
     #[inline(always)]
     pub(super) fn times_from(self, b: Self, c: Self) -> Self {
-        // Subtracted from -0, which is how a compiler knows a change of sign; it becomes part of the instruction.
+        // Subtracted from -0, which is how a compiler knows a change of sign; it becomes part of
+        // the instruction.
         let sign = T::of(-0.0).splat();
         each_register!(i => (sign - self.0[i]).mul_add(b.0[i], c.0[i]))
     }
@@ -187,7 +190,8 @@ fn kept<S: Simd, T: Real>(mask: Mask<S, T>, register: Vector<S, T>) -> Vector<S,
     if bits.len() != size_of::<Vector<S, T>>() {
         return mask.select(register, T::ZERO.splat());
     }
-    // A mask of a register's size has all bits of a lane set or none, which makes this one operation instead of two.
+    // A mask of a register's size has all bits of a lane set or none, which makes this one
+    // operation instead of two.
     let bits: Vector<S, u32> = bytemuck::pod_read_unaligned(bits);
     (bits & register.reinterpret()).reinterpret()
 }

@@ -81,9 +81,9 @@ pub(super) struct RowOfTilesBackward<'a, T> {
 }
 
 impl<T: Real> RowOfTilesBackward<'_, T> {
-    /// In registers of 256 bits at most: it writes a splat's sums, which lie in memory, once for every block. Wider
-    /// registers take twice as long for that as for anything else where they are halves to the processor (Zen 4), and
-    /// gain nothing where they are not (Zen 5).
+    /// In registers of 256 bits at most: it writes a splat's sums, which lie in memory, once for
+    /// every block. Wider registers take twice as long for that as for anything else where they are
+    /// halves to the processor (Zen 4), and gain nothing where they are not (Zen 5).
     pub(super) fn run(self) -> Vec<T> {
         let registers = match registers() {
             #[cfg(target_arch = "x86_64")]
@@ -186,7 +186,8 @@ mod tests {
 
     const CHANNELS: usize = 5;
 
-    /// Image, what partial gradients each listed splat has in its tiles, and the background's gradient.
+    /// Image, what partial gradients each listed splat has in its tiles, and the background's
+    /// gradient.
     struct Both<'a, T> {
         view: &'a View<'a, T>,
         grad: &'a [T],
@@ -227,8 +228,8 @@ mod tests {
         }
     }
 
-    /// Compares all registers that this processor has, from one number wide on, with each other and a reference; returns what
-    /// the widest give.
+    /// Compares all registers that this processor has, from one number wide on, with each other and
+    /// a reference; returns what the widest give.
     fn agrees<T: Real>(reference: Option<&[Vec<f64>; 3]>, tolerance: f64) -> [Vec<f64>; 3] {
         let mut rng = rand_pcg::Pcg64::seed_from_u64(21);
         let size = ImageSize {

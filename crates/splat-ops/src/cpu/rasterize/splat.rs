@@ -10,8 +10,8 @@ use super::gradient::MOMENTS;
 use super::pixels::{Columns, Pixels};
 use crate::settings::RasterizeArgs;
 
-/// Side of a block, the pixels that are worked on at once: as long as it is wide, since then fewest pixels are tested that
-/// a splat does not reach, whatever way it lies.
+/// Side of a block, the pixels that are worked on at once: as long as it is wide, since then fewest
+/// pixels are tested that a splat does not reach, whatever way it lies.
 pub(super) const SIDE: usize = 4;
 
 /// Pixels of a block, row by row.
@@ -26,21 +26,23 @@ pub(super) const BLOCKS: usize = ACROSS * ACROSS;
 /// One value per pixel of a block.
 pub(super) type Lanes<T> = [T; LANES];
 
-/// As wide registers want it in memory: what lies across two lines of the cache is read and written twice as slowly.
+/// As wide registers want it in memory: what lies across two lines of the cache is read and written
+/// twice as slowly.
 #[derive(Debug, Clone, Copy)]
 #[repr(align(64))]
 pub(super) struct Aligned<V>(pub(super) V);
 
 impl<T: Real> Splat<T> {
-    /// The blocks of the tile that the ellipse reaches, a bit for each: in each row of blocks those from where it lies
-    /// farthest left to where it lies farthest right.
+    /// The blocks of the tile that the ellipse reaches, a bit for each: in each row of blocks those
+    /// from where it lies farthest left to where it lies farthest right.
     #[inline(always)]
     pub(super) fn blocks(&self, [left, top]: [T; 2]) -> u16 {
-        // From its middle to the first and the last pixel of a block; a thousandth of a pixel stands for rounding.
+        // From its middle to the first and the last pixel of a block; a thousandth of a pixel
+        // stands for rounding.
         let (to_pixel, slack) = (T::of((SIDE - 1) as f64 / 2.0), T::of(1e-3));
         let (corner, side) = (self.mean[0] - left, T::of(1.0 / SIDE as f64));
-        // In each row of blocks the first, and then the one after the last, each as a power of two: their difference
-        // is a run of bits.
+        // In each row of blocks the first, and then the one after the last, each as a power of two:
+        // their difference is a run of bits.
         let mut ends = [0i32; 2 * ACROSS];
         for i in 0..2 * ACROSS {
             let sign = if i < ACROSS { -T::ONE } else { T::ONE };
@@ -77,8 +79,8 @@ impl<T: Real> Splat<T> {
         Pixels::splat(self.opacity).times(falloffs)
     }
 
-    /// Gradients of screen mean, w11, w21, w22, and of the opacity, from a splat's sums of g times 1, z1, z2, z1^2, z1 z2
-    /// and z2^2; see the formulas in `gradient.rs`.
+    /// Gradients of screen mean, w11, w21, w22, and of the opacity, from a splat's sums of g times
+    /// 1, z1, z2, z1^2, z1 z2 and z2^2; see the formulas in `gradient.rs`.
     #[inline(always)]
     pub(super) fn gradients(&self, [one, z1, z2, z11, z12, z22]: [T; MOMENTS]) -> ([T; 5], T) {
         let (unit, square) = (T::of(1.0 / UNIT), T::of(1.0 / (UNIT * UNIT)));
@@ -175,7 +177,8 @@ impl<T: Real> Thresholds<T> {
         alpha.where_at_least(raw, gate)
     }
 
-    /// A gradient by the raw alpha where it is passed on: at the cap alpha no longer depends on anything.
+    /// A gradient by the raw alpha where it is passed on: at the cap alpha no longer depends on
+    /// anything.
     #[inline(always)]
     pub(super) fn below_cap<S: Simd>(
         &self,

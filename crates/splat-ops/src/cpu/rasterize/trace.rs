@@ -16,13 +16,14 @@ pub(super) const fn kept_per_intersection(number: usize) -> usize {
 
 /// State of the tiles of a row, one after the other.
 pub(super) struct Trace<T> {
-    /// The blocks that every splat of each tile's list reaches, a bit per block; none from the batch on that found every
-    /// pixel stopped.
+    /// The blocks that every splat of each tile's list reaches, a bit per block; none from the
+    /// batch on that found every pixel stopped.
     pub(super) reached: Vec<u16>,
-    /// The place in the list of the splat before which each pixel stopped; `i32::MAX` where it did not.
+    /// The place in the list of the splat before which each pixel stopped; `i32::MAX` where it did
+    /// not.
     pub(super) stop: Vec<ByBlock<i32>>,
-    /// Transmittance in front of every batch of a list but the first, as far as there is any, and, if there is a
-    /// background, behind the last splat. One minus alpha would lose its digits.
+    /// Transmittance in front of every batch of a list but the first, as far as there is any, and,
+    /// if there is a background, behind the last splat. One minus alpha would lose its digits.
     pub(super) transmittance: Vec<ByBlock<T>>,
     /// Where each tile's end among these.
     ends: Vec<usize>,

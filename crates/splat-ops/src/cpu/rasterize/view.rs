@@ -21,7 +21,8 @@ use crate::settings::RasterizeArgs;
 /// Prefetch distance, in partial gradients.
 const AHEAD: usize = 16;
 
-/// State that the forward pass keeps for the backward pass: a [`Frame`] per camera, none of an image that was not rendered.
+/// State that the forward pass keeps for the backward pass: a [`Frame`] per camera, none of an
+/// image that was not rendered.
 #[derive(Debug, Clone)]
 pub struct State(Arc<dyn Any + Send + Sync>);
 
@@ -47,8 +48,8 @@ pub(super) struct Listed<T> {
 }
 
 impl<T: Real> Listed<T> {
-    /// Bytes kept of each intersection by the forward pass, and, where a backward pass follows, by its
-    /// partial gradients.
+    /// Bytes kept of each intersection by the forward pass, and, where a backward pass follows, by
+    /// its partial gradients.
     fn kept_per_intersection(channels: usize, args: &RasterizeArgs) -> usize {
         let number = size_of::<T>();
         let partials = if args.backward {
@@ -84,7 +85,8 @@ impl<T: Real> Listed<T> {
         })
     }
 
-    /// Sums some of a splat's partial gradients over its tiles, in the order in which these were emitted.
+    /// Sums some of a splat's partial gradients over its tiles, in the order in which these were
+    /// emitted.
     #[inline(always)]
     pub(super) fn sum<const COUNT: usize>(
         &self,
@@ -171,7 +173,8 @@ impl<'a, T: Real> View<'a, T> {
         }
     }
 
-    /// How many splats the tiles of a row have together: its length in what is kept per intersection, and its work.
+    /// How many splats the tiles of a row have together: its length in what is kept per
+    /// intersection, and its work.
     pub(super) fn intersections_of_row(&self, ty: usize) -> usize {
         self.lists.row_of_tiles(ty, self.grid).len()
     }

@@ -19,15 +19,18 @@ use crate::{ErrorSlot, OpError, Projected, RasterizeSettings};
 pub struct RasterizeWork {
     /// Listed intersections of splats and tiles.
     pub intersections: u64,
-    /// Pairs of a pixel and a splat whose alpha the forward pass evaluates. The backward pass evaluates about as many.
+    /// Pairs of a pixel and a splat whose alpha the forward pass evaluates. The backward pass
+    /// evaluates about as many.
     pub tested: u64,
-    /// Those of them whose alpha reaches `alpha_min`; on the CPU beyond the image's edges too, in the tiles that lie across.
+    /// Those of them whose alpha reaches `alpha_min`; on the CPU beyond the image's edges too, in
+    /// the tiles that lie across.
     pub seen: u64,
     /// Those of them that are blended: the pixel exists and had not stopped.
     pub blended: u64,
 }
 
-/// Counts the work of [`rasterize`](crate::rasterize) with the same arguments, by doing it on the CPU, wherever they are.
+/// Counts the work of [`rasterize`](crate::rasterize) with the same arguments, by doing it on the
+/// CPU, wherever they are.
 ///
 /// # Errors
 /// As [`rasterize`](crate::rasterize).
@@ -145,8 +148,8 @@ mod tests {
     use burn::tensor::{Device, TensorData};
     use rand::{RngExt, SeedableRng};
 
-    /// Against brute force over every pixel in double precision: no pair that is seen goes untested, and most pairs that
-    /// are tested are seen. Behind an opaque wall nothing is blended.
+    /// Against brute force over every pixel in double precision: no pair that is seen goes
+    /// untested, and most pairs that are tested are seen. Behind an opaque wall nothing is blended.
     #[test]
     fn the_counts_are_those_of_brute_force() {
         let (n, size) = (

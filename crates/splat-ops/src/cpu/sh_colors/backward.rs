@@ -37,8 +37,8 @@ impl ShColorsBackend for Flex {
 }
 
 vectorized! {
-    /// Gradients of the directions, given `weights`, those of the basis functions. d = v / |v|: the gradient of v is what
-    /// is tangential, divided by |v|.
+    /// Gradients of the directions, given `weights`, those of the basis functions. d = v / |v|: the
+    /// gradient of v is what is tangential, divided by |v|.
     fn evaluate_backward<T: Real, const FMA: bool>(
         degree: usize,
         units: &[Lanes<T>; 4],
@@ -91,7 +91,8 @@ struct Chunk<'a, T> {
 }
 
 impl<T: Real> Chunk<'_, T> {
-    /// Adds the gradients through one camera, given those of its colours; returns that of its centre.
+    /// Adds the gradients through one camera, given those of its colours; returns that of its
+    /// centre.
     fn add(&mut self, inputs: &Inputs<T>, camera: usize, grad: &[T]) -> Vec3<T> {
         let mut of_center = [T::ZERO; 3];
         let (center, is_seen) = inputs.camera(camera);
@@ -138,8 +139,8 @@ impl<T: Real> Chunk<'_, T> {
 }
 
 vectorized! {
-    /// Adds the gradients of the coefficients of up to [`LANES`] Gaussians, given the basis in their directions and the
-    /// gradients of all colours; and writes those of the basis functions.
+    /// Adds the gradients of the coefficients of up to [`LANES`] Gaussians, given the basis in
+    /// their directions and the gradients of all colours; and writes those of the basis functions.
     fn add_to_rows<T: Real, const FMA: bool>(
         chunk: &mut Chunk<T>,
         rows: &[usize],
@@ -199,8 +200,8 @@ fn add_to_degree<T: Real, const REST: usize>(
     }
 }
 
-/// `out = scale values` for one scale after the other. Four numbers are written at once: the last one is overwritten by the
-/// next three.
+/// `out = scale values` for one scale after the other. Four numbers are written at once: the last
+/// one is overwritten by the next three.
 #[inline(always)]
 fn write_scaled<T: Real, const COUNT: usize>(
     out: &mut [T],

@@ -1,5 +1,6 @@
-//! Whether the parts of a checkpoint fit together, before any of it reaches a device: what is let through here must neither
-//! stop a run later nor spoil it. What only the model, the strategy and the hooks know is checked where they are restored.
+//! Whether the parts of a checkpoint fit together, before any of it reaches a device: what is let
+//! through here must neither stop a run later nor spoil it. What only the model, the strategy and
+//! the hooks know is checked where they are restored.
 
 use burn_pack::Scalar;
 
@@ -13,8 +14,8 @@ pub(super) const MEANS: &str = "model.means";
 /// End of the name of an optimiser's count of steps.
 const TIME: &str = ".time";
 
-/// Tensors: there are means, the fields that every model of Gaussians has are as wide as they are, and all have numbers in
-/// them.
+/// Tensors: there are means, the fields that every model of Gaussians has are as wide as they are,
+/// and all have numbers in them.
 pub(super) fn tensors(tensors: &[SavedTensor]) -> Result<(), String> {
     let means = tensors.iter().find(|(name, ..)| name == MEANS);
     let n = match means.map(|(_, shape, _)| shape.as_slice()) {

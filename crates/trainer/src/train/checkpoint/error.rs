@@ -57,7 +57,8 @@ pub enum CheckpointError {
         /// Steps asked for.
         wanted: usize,
     },
-    /// The state could not be read back from the device, or holds what no checkpoint has a place for.
+    /// The state could not be read back from the device, or holds what no checkpoint has a place
+    /// for.
     #[error("the state of the run cannot be saved: {0}")]
     State(String),
 }

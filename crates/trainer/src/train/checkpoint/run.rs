@@ -1,4 +1,5 @@
-//! Which run a checkpoint belongs to: its settings and its capture. Another run does not go on from it.
+//! Which run a checkpoint belongs to: its settings and its capture. Another run does not go on from
+//! it.
 
 use serde::{Deserialize, Serialize};
 
@@ -26,9 +27,10 @@ impl Checkpoint {
         &self.meta.run.config
     }
 
-    /// Checks that a run with these settings is the run of this checkpoint, and has something left to train. Only
-    /// `steps` and `density.max_gaussians` may be others: everything else, the seed and the first Gaussians included,
-    /// would make it a run that nobody could repeat, and partly have no effect any more.
+    /// Checks that a run with these settings is the run of this checkpoint, and has something left
+    /// to train. Only `steps` and `density.max_gaussians` may be others: everything else, the seed
+    /// and the first Gaussians included, would make it a run that nobody could repeat, and partly
+    /// have no effect any more.
     ///
     /// # Errors
     /// [`CheckpointError::OtherSettings`] and [`CheckpointError::NothingLeft`].
@@ -55,7 +57,8 @@ impl Checkpoint {
         Ok(())
     }
 
-    /// What going on with these settings changes about the run, and what was changed before, each in a line.
+    /// What going on with these settings changes about the run, and what was changed before, each
+    /// in a line.
     pub fn changes_with(&self, config: &TrainConfig) -> Vec<String> {
         let mut changes = self.meta.run.changes.clone();
         for (name, was, is) in self.config().differences(config) {
@@ -69,8 +72,8 @@ impl Checkpoint {
         changes
     }
 
-    /// Checks that the run is this one: its capture, its settings, its strategy, the names of its loss terms. Returns the photos
-    /// that have other pixels.
+    /// Checks that the run is this one: its capture, its settings, its strategy, the names of its
+    /// loss terms. Returns the photos that have other pixels.
     pub(in super::super) fn check_run(
         &self,
         run: &RunRecord,

@@ -1,4 +1,5 @@
-//! Damaged checkpoints: every part that does not fit the others is refused when the file is read, by name.
+//! Damaged checkpoints: every part that does not fit the others is refused when the file is read,
+//! by name.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -121,7 +122,8 @@ fn not_resumed(checkpoint: Checkpoint) -> String {
     message
 }
 
-/// Moments of another shape ended the first step by a panic; parts that are missing would have started anew.
+/// Moments of another shape ended the first step by a panic; parts that are missing would have
+/// started anew.
 #[test]
 fn parts_that_do_not_fit_the_run_are_refused_when_it_goes_on() {
     let good = saved();

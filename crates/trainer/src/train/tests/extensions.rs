@@ -249,7 +249,8 @@ fn extended(steps: usize) -> TrainerBuilder<Dimmed> {
         })
 }
 
-/// A run made of parts from outside trains, and goes on from a checkpoint in the middle with the same numbers.
+/// A run made of parts from outside trains, and goes on from a checkpoint in the middle with the
+/// same numbers.
 #[test]
 fn parts_from_outside_train_and_resume() {
     let whole = extended(9).build().unwrap().run().unwrap();
@@ -316,7 +317,8 @@ fn a_step_of_several_views_is_along_their_mean() {
     assert!(double.history.losses[1].total < double.history.losses[0].total * 1.2);
 }
 
-/// Told between its steps, a run waits, takes single steps, gives its scene, keeps its state and ends.
+/// Told between its steps, a run waits, takes single steps, gives its scene, keeps its state and
+/// ends.
 #[test]
 fn a_run_does_what_it_is_told() {
     fn is_send<T: Send>(value: T) -> T {

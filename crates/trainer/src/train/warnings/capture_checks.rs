@@ -10,19 +10,21 @@ use super::{Warning, median, quantile};
 use crate::train::TrainConfig;
 use splat_data::{Capture, View};
 
-/// Points that share a place are a warning from this share of all on: matches found twice are a few percent.
+/// Points that share a place are a warning from this share of all on: matches found twice are a few
+/// percent.
 const COINCIDENT: f64 = 0.5;
-/// Half of the points lie within this share of the cameras' distance: under a tenth of a degree, a few pixels of a
-/// photo, where nothing can be seen of them.
+/// Half of the points lie within this share of the cameras' distance: under a tenth of a degree, a
+/// few pixels of a photo, where nothing can be seen of them.
 const COMPACT: f64 = 1e-3;
-/// Median standard deviation over the cameras' distance. A splat is visible over about three standard deviations to
-/// either side, at a quarter wider than a picture of 70 degrees; points of real captures give about 0.005.
+/// Median standard deviation over the cameras' distance. A splat is visible over about three
+/// standard deviations to either side, at a quarter wider than a picture of 70 degrees; points of
+/// real captures give about 0.005.
 const LARGE: f64 = 0.25;
 /// Cameras are compared with each other where there are at least this many; of fewer none is usual.
 const COMPARABLE: usize = 4;
-/// A camera stands among the points where the nearest percent is below this share of its usual distance (real
-/// captures stay above 0.4), and half of the points below [`INSIDE_MIDDLE`] of theirs. A close-up has the first alone;
-/// the cameras in a room neither, being all alike.
+/// A camera stands among the points where the nearest percent is below this share of its usual
+/// distance (real captures stay above 0.4), and half of the points below [`INSIDE_MIDDLE`] of
+/// theirs. A close-up has the first alone; the cameras in a room neither, being all alike.
 const INSIDE_NEAR: f64 = 0.25;
 /// See [`INSIDE_NEAR`].
 const INSIDE_MIDDLE: f64 = 0.6;
@@ -30,8 +32,8 @@ const INSIDE_MIDDLE: f64 = 0.6;
 const FAR: f64 = 5.0;
 /// A camera sees few points below this share of what is usual; real captures stay above 0.35.
 const FEW: f64 = 0.1;
-/// Correlation of neighbouring pixels, below which a photo is noise: noise has 0 within 0.05, photos of real scenes
-/// 0.6 or more, even at an eighth of their size.
+/// Correlation of neighbouring pixels, below which a photo is noise: noise has 0 within 0.05,
+/// photos of real scenes 0.6 or more, even at an eighth of their size.
 const NOISE: f64 = 0.2;
 /// So many rows of a photo are enough to tell noise.
 const NOISE_ROWS: u32 = 64;
@@ -174,7 +176,8 @@ fn noise(views: &[View]) -> Option<Warning> {
     })
 }
 
-/// Whether neighbours in a row of the photo's green channel are uncorrelated. A photo of one colour is not noise.
+/// Whether neighbours in a row of the photo's green channel are uncorrelated. A photo of one colour
+/// is not noise.
 fn is_noise(view: &View) -> bool {
     let width = view.width as usize;
     let every = (view.height / NOISE_ROWS).max(1) as usize;

@@ -7,14 +7,17 @@ use crate::train::LossRecord;
 const VISITS: usize = 3;
 /// Views are compared with each other where there are at least this many; of fewer none is usual.
 const COMPARABLE: usize = 4;
-/// A view is hard from this multiple of the usual loss on, if it also stands out by [`HARD_SPREAD`] and has not fallen
-/// below [`STAYS`]: views that are merely harder than others reach 2.0, but their loss falls.
+/// A view is hard from this multiple of the usual loss on, if it also stands out by [`HARD_SPREAD`]
+/// and has not fallen below [`STAYS`]: views that are merely harder than others reach 2.0, but
+/// their loss falls.
 const HARD: f64 = 1.75;
 /// Median deviations of the views' losses between a hard view and the usual one.
 const HARD_SPREAD: f64 = 8.0;
-/// The loss rises from this multiple of its least on. Rows that were just split raise it by 1.35 for some steps.
+/// The loss rises from this multiple of its least on. Rows that were just split raise it by 1.35
+/// for some steps.
 const RISES: f64 = 1.5;
-/// A loss does not fall from this share of the first on; that of a real capture halves in a few hundred steps.
+/// A loss does not fall from this share of the first on; that of a real capture halves in a few
+/// hundred steps.
 const STAYS: f64 = 0.9;
 /// Losses are compared where there are at least this many at each time.
 const STEPS: usize = 25;
@@ -35,8 +38,8 @@ pub(in crate::train) fn is_due(step: usize, steps: usize) -> bool {
 }
 
 impl Course<'_> {
-    /// Everything that looks wrong. `view_at` names the view of a step (from 0), by an index below `views`;
-    /// `name` gives its photo.
+    /// Everything that looks wrong. `view_at` names the view of a step (from 0), by an index below
+    /// `views`; `name` gives its photo.
     pub(in crate::train) fn inspect(
         &self,
         views: usize,
