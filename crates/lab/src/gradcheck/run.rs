@@ -1,7 +1,7 @@
 //! Renders a scene with our ops and takes the gradients of its loss with Burn's autodiff.
 
-use burn::tensor::{DType, Device, Tensor, TensorData};
-use splat_ops::{Projected, project, rasterize, spherical_harmonics};
+use burn::tensor::{DType, Device, Gradients, Tensor, TensorData};
+use splat_ops::{OpError, Projected, Rendered, project, rasterize, spherical_harmonics};
 
 use super::scene::{Array, Inputs, Outputs, Scene};
 use super::{GradcheckError, Precision};
@@ -66,132 +66,185 @@ pub fn run(
         device: device.clone().autodiff(),
         dtype,
     };
-    let (c, n) = (scene.cameras, scene.gaussians);
-    let (w, h) = (scene.size.width as usize, scene.size.height as usize);
-    let inputs = &scene.inputs;
-
-    // Leaves, cameras in front.
-    let means = upload.leaf::<2>(&inputs.means, [n, 3]);
-    let quats = upload.leaf::<2>(&inputs.quats, [n, 4]);
-    let scales = upload.leaf::<2>(&inputs.scales, [n, 3]);
-    let opacities = upload.leaf::<1>(&inputs.opacities, [n]);
-    let rows = inputs.sh_coeffs.shape[1];
-    let sh_coeffs = upload.leaf::<3>(&inputs.sh_coeffs, [n, rows, 3]);
-    let viewmats = upload.leaf::<3>(&inputs.viewmat, [c, 4, 4]);
-    let intrinsics = upload.leaf::<2>(&inputs.intrinsics, [c, 4]);
-    let background = upload.leaf::<1>(&inputs.background, [3]);
-
-    // Screen splats.
-    let mut settings = scene.project;
-    if bug == Some(Bug::ClampIgnored) {
-        settings.clamp_margin = 1e6;
-    }
-    let (shape_quats, shape_scales) = match bug {
-        Some(Bug::QuaternionNormalisationSkipped) => {
-            quaternion_normalisation_skipped(quats.clone(), scales.clone())
-        }
-        _ => (quats.clone(), scales.clone()),
-    };
+    let leaves = Leaves::new(scene, &upload);
     let op = |source| GradcheckError::Op {
         file: scene.source.clone(),
         source,
     };
-    let mut projected = project(
-        means.clone(),
-        shape_quats,
-        shape_scales,
-        viewmats.clone(),
-        intrinsics.clone(),
-        scene.size,
-        &settings,
-    )
-    .map_err(op)?;
-    if bug == Some(Bug::OffDiagonalHalved) {
-        projected = off_diagonal_halved(&projected).map_err(op)?;
-    }
-
-    // Colours, seen from the camera centre -W^T t.
-    let rotation = viewmats.clone().narrow(1, 0, 3).narrow(2, 0, 3); // [C, 3, 3]
-    let translation = viewmats.clone().narrow(1, 0, 3).narrow(2, 3, 1); // [C, 3, 1]
-    let centre = (rotation * translation).sum_dim(1).neg(); // [C, 1, 3]
-    // Repeated rather than broadcast, and `-1` rather than N: with N = 0, `expand` panics and
-    // `reshape` reads the 0 as "keep the length of this dimension".
-    let mut directions = means.clone().reshape([1, -1, 3]).repeat_dim(0, c) // [C, N, 3]
-        - centre.repeat_dim(1, n);
-    if bug == Some(Bug::DirectionDetached) {
-        directions = directions.detach();
-    }
-    let colors = spherical_harmonics(sh_coeffs.clone(), directions, scene.sh_degree)
-        .map_err(op)?
-        .add_scalar(0.5)
-        .clamp_min(0.0);
-
-    // Depth is one more colour, over a background of zero.
-    let backdrop = background.clone().reshape([1, 3]).expand([c, 3]);
-    let (colors, backdrop) = match scene.upstream.depth {
-        None => (colors, backdrop),
-        Some(_) => (
-            Tensor::cat(vec![colors, projected.depths().unsqueeze_dim::<3>(2)], 2),
-            Tensor::cat(
-                vec![backdrop, Tensor::zeros([c, 1], (&upload.device, dtype))],
-                1,
-            ),
-        ),
-    };
-    let mut blended = opacities.clone().reshape([1, -1]).repeat_dim(0, c); // [C, N]
-    if scene.antialias {
-        blended = blended * projected.compensations();
-    }
-    let rendered = rasterize(
-        &projected,
-        colors,
-        blended.clone(),
-        Some(backdrop),
-        &scene.rasterize,
-    )
-    .map_err(op)?;
-
-    // The loss, and its gradients.
+    let projected = leaves.project(scene, bug).map_err(op)?;
+    let (rendered, blended) = leaves.render(scene, &projected, bug).map_err(op)?;
     let image = rendered.image().narrow(3, 0, 3);
-    let alpha = rendered.alpha();
-    let depth = scene
-        .upstream
-        .depth
-        .as_ref()
+    let depth = (scene.upstream.depth.as_ref())
         .map(|upstream| (rendered.image().narrow(3, 3, 1), upstream));
-    let weighted = |output: &Tensor<4>, upstream: &Array, channels| {
-        let upstream = upload.constant::<4>(upstream, [c, h, w, channels]);
-        (output.clone() * upstream).sum()
-    };
-    let mut loss =
-        weighted(&image, &scene.upstream.image, 3) + weighted(&alpha, &scene.upstream.alpha, 1);
-    if let Some((depth, upstream)) = &depth {
-        loss = loss + weighted(depth, upstream, 1);
-    }
+    let loss = loss(scene, &upload, (&image, &rendered.alpha()), depth.as_ref());
     let grads = loss.backward();
 
     let download = Download { scene };
+    let (c, n) = (scene.cameras, scene.gaussians);
     Ok(Computed {
         outputs: Outputs {
             image: download.tensor(image, &scene.upstream.image.shape)?,
-            alpha: download.tensor(alpha, &scene.upstream.alpha.shape)?,
+            alpha: download.tensor(rendered.alpha(), &scene.upstream.alpha.shape)?,
             depth: depth
                 .map(|(depth, _)| download.tensor(depth, &scene.upstream.alpha.shape))
                 .transpose()?,
         },
-        gradients: Inputs {
-            means: download.gradient(means.grad(&grads), &inputs.means)?,
-            quats: download.gradient(quats.grad(&grads), &inputs.quats)?,
-            scales: download.gradient(scales.grad(&grads), &inputs.scales)?,
-            opacities: download.gradient(opacities.grad(&grads), &inputs.opacities)?,
-            sh_coeffs: download.gradient(sh_coeffs.grad(&grads), &inputs.sh_coeffs)?,
-            viewmat: download.gradient(viewmats.grad(&grads), &inputs.viewmat)?,
-            intrinsics: download.gradient(intrinsics.grad(&grads), &inputs.intrinsics)?,
-            background: download.gradient(background.grad(&grads), &inputs.background)?,
-        },
+        gradients: leaves.gradients(scene, &grads, &download)?,
         projected: download.tensor(projected.packed(), &[c, n, 9])?,
         opacities: download.tensor(blended, &[c, n])?,
     })
+}
+
+/// The sum of all outputs under the scene's weights.
+fn loss(
+    scene: &Scene,
+    upload: &Upload,
+    (image, alpha): (&Tensor<4>, &Tensor<4>),
+    depth: Option<&(Tensor<4>, &Array)>,
+) -> Tensor<1> {
+    let (w, h) = (scene.size.width as usize, scene.size.height as usize);
+    let weighted = |output: &Tensor<4>, upstream: &Array, channels| {
+        let upstream = upload.constant::<4>(upstream, [scene.cameras, h, w, channels]);
+        (output.clone() * upstream).sum()
+    };
+    let loss =
+        weighted(image, &scene.upstream.image, 3) + weighted(alpha, &scene.upstream.alpha, 1);
+    match depth {
+        Some((depth, upstream)) => loss + weighted(depth, upstream, 1),
+        None => loss,
+    }
+}
+
+/// The inputs of a scene on a device, cameras in front.
+struct Leaves {
+    means: Tensor<2>,
+    quats: Tensor<2>,
+    scales: Tensor<2>,
+    opacities: Tensor<1>,
+    sh_coeffs: Tensor<3>,
+    viewmats: Tensor<3>,
+    intrinsics: Tensor<2>,
+    background: Tensor<1>,
+}
+
+impl Leaves {
+    fn new(scene: &Scene, upload: &Upload) -> Self {
+        let (c, n) = (scene.cameras, scene.gaussians);
+        let inputs = &scene.inputs;
+        let rows = inputs.sh_coeffs.shape[1];
+        Self {
+            means: upload.leaf(&inputs.means, [n, 3]),
+            quats: upload.leaf(&inputs.quats, [n, 4]),
+            scales: upload.leaf(&inputs.scales, [n, 3]),
+            opacities: upload.leaf(&inputs.opacities, [n]),
+            sh_coeffs: upload.leaf(&inputs.sh_coeffs, [n, rows, 3]),
+            viewmats: upload.leaf(&inputs.viewmat, [c, 4, 4]),
+            intrinsics: upload.leaf(&inputs.intrinsics, [c, 4]),
+            background: upload.leaf(&inputs.background, [3]),
+        }
+    }
+
+    /// Screen splats.
+    fn project(&self, scene: &Scene, bug: Option<Bug>) -> Result<Projected, OpError> {
+        let mut settings = scene.project;
+        if bug == Some(Bug::ClampIgnored) {
+            settings.clamp_margin = 1e6;
+        }
+        let (quats, scales) = (self.quats.clone(), self.scales.clone());
+        let (quats, scales) = match bug {
+            Some(Bug::QuaternionNormalisationSkipped) => {
+                quaternion_normalisation_skipped(quats, scales)
+            }
+            _ => (quats, scales),
+        };
+        let projected = project(
+            self.means.clone(),
+            quats,
+            scales,
+            self.viewmats.clone(),
+            self.intrinsics.clone(),
+            scene.size,
+            &settings,
+        )?;
+        match bug {
+            Some(Bug::OffDiagonalHalved) => off_diagonal_halved(&projected),
+            _ => Ok(projected),
+        }
+    }
+
+    /// Colours `[C, N, 3]`, seen from the camera centre -W^T t.
+    fn colors(&self, scene: &Scene, bug: Option<Bug>) -> Result<Tensor<3>, OpError> {
+        let (c, n) = (scene.cameras, scene.gaussians);
+        let rotation = self.viewmats.clone().narrow(1, 0, 3).narrow(2, 0, 3); // [C, 3, 3]
+        let translation = self.viewmats.clone().narrow(1, 0, 3).narrow(2, 3, 1); // [C, 3, 1]
+        let centre = (rotation * translation).sum_dim(1).neg(); // [C, 1, 3]
+        // Repeated rather than broadcast, and `-1` rather than N: with N = 0, `expand` panics and
+        // `reshape` reads the 0 as "keep the length of this dimension".
+        let mut directions = self.means.clone().reshape([1, -1, 3]).repeat_dim(0, c) // [C, N, 3]
+            - centre.repeat_dim(1, n);
+        if bug == Some(Bug::DirectionDetached) {
+            directions = directions.detach();
+        }
+        let colors = spherical_harmonics(self.sh_coeffs.clone(), directions, scene.sh_degree)?;
+        Ok(colors.add_scalar(0.5).clamp_min(0.0))
+    }
+
+    /// The picture, whose fourth channel is the depth where there is a loss of it, and the
+    /// opacities at the rasteriser.
+    fn render(
+        &self,
+        scene: &Scene,
+        projected: &Projected,
+        bug: Option<Bug>,
+    ) -> Result<(Rendered, Tensor<2>), OpError> {
+        let c = scene.cameras;
+        let colors = self.colors(scene, bug)?;
+        let backdrop = self.background.clone().reshape([1, 3]).expand([c, 3]);
+        // Depth is one more colour, over a background of zero.
+        let (colors, backdrop) = match scene.upstream.depth {
+            None => (colors, backdrop),
+            Some(_) => {
+                let depths = projected.depths().unsqueeze_dim::<3>(2);
+                let zero = Tensor::zeros([c, 1], (&backdrop.device(), backdrop.dtype()));
+                (
+                    Tensor::cat(vec![colors, depths], 2),
+                    Tensor::cat(vec![backdrop, zero], 1),
+                )
+            }
+        };
+        let mut blended = self.opacities.clone().reshape([1, -1]).repeat_dim(0, c); // [C, N]
+        if scene.antialias {
+            blended = blended * projected.compensations();
+        }
+        let opacities = blended.clone();
+        let rendered = rasterize(
+            projected,
+            colors,
+            opacities,
+            Some(backdrop),
+            &scene.rasterize,
+        )?;
+        Ok((rendered, blended))
+    }
+
+    fn gradients(
+        &self,
+        scene: &Scene,
+        grads: &Gradients,
+        download: &Download,
+    ) -> Result<Inputs, GradcheckError> {
+        let inputs = &scene.inputs;
+        Ok(Inputs {
+            means: download.gradient(self.means.grad(grads), &inputs.means)?,
+            quats: download.gradient(self.quats.grad(grads), &inputs.quats)?,
+            scales: download.gradient(self.scales.grad(grads), &inputs.scales)?,
+            opacities: download.gradient(self.opacities.grad(grads), &inputs.opacities)?,
+            sh_coeffs: download.gradient(self.sh_coeffs.grad(grads), &inputs.sh_coeffs)?,
+            viewmat: download.gradient(self.viewmats.grad(grads), &inputs.viewmat)?,
+            intrinsics: download.gradient(self.intrinsics.grad(grads), &inputs.intrinsics)?,
+            background: download.gradient(self.background.grad(grads), &inputs.background)?,
+        })
+    }
 }
 
 /// The same values, with the gradients of a backward that forgets to differentiate q / |q|.
@@ -209,7 +262,7 @@ fn quaternion_normalisation_skipped(quats: Tensor<2>, scales: Tensor<2>) -> (Ten
 }
 
 /// The same screen splats, with half the gradient into w21.
-fn off_diagonal_halved(projected: &Projected) -> Result<Projected, splat_ops::OpError> {
+fn off_diagonal_halved(projected: &Projected) -> Result<Projected, OpError> {
     let packed = projected.packed();
     let w21 = packed.clone().narrow(2, 4, 1);
     let halved = w21.clone().mul_scalar(0.5) + w21.mul_scalar(0.5).detach();

@@ -8,6 +8,7 @@
 mod arithmetic;
 mod device_memory;
 pub mod device_step;
+mod limits;
 mod machine;
 pub mod page;
 pub mod rasterize;

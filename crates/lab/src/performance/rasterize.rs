@@ -14,6 +14,7 @@ use splat_ops::device::device_info;
 
 use super::arithmetic::{self, Arithmetic};
 use super::device_step::write_device;
+use super::limits::{AVX2, AVX512, Limit, SCALAR, limit};
 use super::stages::{Recording, Stage};
 use super::work::sample;
 use super::{Machine, PerformanceError, Spread, Work, all_threads, on_threads};
@@ -26,44 +27,6 @@ const VIEWS: usize = 8;
 const WARM_UP: usize = 1;
 /// Passes over the views that are measured, unless time is up.
 const PASSES: usize = 30;
-
-/// 1e9 evaluations per second and core.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct Limit {
-    /// What the arithmetic of the inner loop reached on a machine with AVX-512: a tile of 16 x 16
-    /// pixels with 256 splats, in cache, forward and backward. Not all of it was measured.
-    reached: [Option<f64>; 2],
-    /// What the rasteriser shall reach, forward and backward.
-    goal: Option<[f64; 2]>,
-}
-
-const AVX512: Limit = Limit {
-    reached: [Some(3.6), Some(1.2)],
-    goal: Some([2.5, 0.8]),
-};
-
-const AVX2: Limit = Limit {
-    reached: [Some(2.0), None],
-    goal: Some([1.4, 0.5]),
-};
-
-const BASELINE: Limit = Limit {
-    reached: [None; 2],
-    goal: None,
-};
-
-/// The same of scalar code with libm, forward.
-const SCALAR: f64 = 0.1;
-
-/// The limit of the instructions that ran. None was measured for NEON, whose vectors are half of
-/// AVX2's; it is held against AVX2.
-fn limit(instructions: InstructionSet) -> Limit {
-    match instructions {
-        InstructionSet::Avx512 => AVX512,
-        InstructionSet::Avx2 | InstructionSet::Neon => AVX2,
-        InstructionSet::Baseline => BASELINE,
-    }
-}
 
 /// The rasteriser on the views of a capture.
 #[derive(Debug, Clone, PartialEq, Serialize)]
