@@ -155,9 +155,9 @@ fn the_state_between_steps_takes_the_bytes_that_are_stated() {
         let capture = Arc::new(synthetic_capture(gaussians, PhotoSize::of_pixels(3072)));
         let report = device_step::measure(&capture, &config, &device, 0.0, |_| {}).unwrap();
         for row in &report.rows {
-            assert!(row.launches > 10.0 && row.waits >= 1.0 && row.instances > 100.0);
+            assert!(row.launches > 10.0 && row.waits >= 1.0 && row.intersections > 100.0);
             assert!(row.share_of_floor > 0.0 && row.share_of_floor < 1.0);
-            assert!(row.reserved_bytes > row.instances);
+            assert!(row.reserved_bytes > row.intersections);
         }
         let [_, row] = &report.rows[..] else { panic!() };
         assert_eq!(row.sh_degree, 3);

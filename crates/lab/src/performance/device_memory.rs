@@ -3,7 +3,7 @@
 //! Between steps there are, of every Gaussian of degree 3: 59 floats that are trained, two moments
 //! of each, and two sums for density control. Within a step come its gradients, what is projected,
 //! and what the rasteriser keeps; of the latter `splat_kernels::rasterize::Kept` has the bytes per
-//! Gaussian, instance and pixel.
+//! Gaussian, intersection and pixel.
 
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};

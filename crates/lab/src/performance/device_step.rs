@@ -56,13 +56,13 @@ pub struct DeviceStepRow {
     pub milliseconds: Spread,
     /// Mean time of steps that follow each other as in training, the last waited for.
     pub milliseconds_in_a_row: f64,
-    /// Launches of our kernels per step, waits of the host for them, instances listed, bytes
+    /// Launches of our kernels per step, waits of the host for them, intersections listed, bytes
     /// reserved.
     pub launches: f64,
     /// How often the host waited.
     pub waits: f64,
     /// (tile, Gaussian) pairs listed.
-    pub instances: f64,
+    pub intersections: f64,
     /// Bytes our kernels reserved.
     pub reserved_bytes: f64,
     /// Bytes that the kernels cannot do without, by stage.
@@ -139,7 +139,7 @@ pub(super) struct DeviceRun {
     in_a_row: f64,
     launches: f64,
     waits: f64,
-    instances: f64,
+    intersections: f64,
     reserved_bytes: f64,
     /// With the device waited for before and after every stage.
     pub(super) staged: Samples,
@@ -195,7 +195,7 @@ pub(super) fn run(
         in_a_row,
         launches: per_step(done.launches),
         waits: per_step(done.waits),
-        instances: per_step(done.intersections),
+        intersections: per_step(done.intersections),
         reserved_bytes: per_step(done.reserved_bytes),
         staged,
         memory,
@@ -215,7 +215,7 @@ impl DeviceRun {
         let sizes = StepSizes {
             gaussians: work.gaussians as u64,
             visible: work.visible as u64,
-            intersections: self.instances as u64,
+            intersections: self.intersections as u64,
             width: u64::from(width),
             height: u64::from(height),
             sh_degree,
@@ -230,7 +230,7 @@ impl DeviceRun {
             milliseconds_in_a_row: 1e3 * self.in_a_row,
             launches: self.launches,
             waits: self.waits,
-            instances: self.instances,
+            intersections: self.intersections,
             reserved_bytes: self.reserved_bytes,
             floor_bytes,
             share_of_floor: floor_bytes as f64 / copied / self.in_a_row,
@@ -260,7 +260,7 @@ impl DeviceStepReport {
         )?;
         writeln!(
             text,
-            "| SH degree | steps | median ms | min | max | ms in a row | launches | waits | instances | MB reserved |"
+            "| SH degree | steps | median ms | min | max | ms in a row | launches | waits | intersections | MB reserved |"
         )?;
         writeln!(text, "|{}", "--:|".repeat(10))?;
         for row in &self.rows {
@@ -273,7 +273,7 @@ impl DeviceStepReport {
                 row.milliseconds_in_a_row,
                 row.launches,
                 row.waits,
-                row.instances,
+                row.intersections,
                 row.reserved_bytes / 1e6
             )?;
         }

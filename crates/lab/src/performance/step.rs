@@ -407,7 +407,7 @@ mod tests {
         assert_eq!(work.pixels, f64::from(width * height));
         assert_eq!((work.views, work.gaussians), (16, capture.points.len()));
         assert!(0.0 < work.visible && work.visible <= work.gaussians as f64);
-        assert!(work.instances >= work.visible / 2.0);
+        assert!(work.intersections >= work.visible / 2.0);
         assert!(0.0 < work.blended && work.blended <= work.seen && work.seen <= work.tested);
     }
 }

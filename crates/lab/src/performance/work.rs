@@ -18,7 +18,7 @@ pub struct Work {
     /// Gaussians that reach into the view.
     pub visible: f64,
     /// (tile, Gaussian) pairs in the lists.
-    pub instances: f64,
+    pub intersections: f64,
     /// Pixels of a view.
     pub pixels: f64,
     /// (pixel, Gaussian) pairs that the inner loop evaluates.
@@ -59,7 +59,7 @@ impl Work {
             let counted =
                 rasterize_work(&projected, colors.clone(), opacities, &settings.rasterize)?;
             work.visible += share * visible.into_scalar::<i64>() as f64;
-            work.instances += share * counted.intersections as f64;
+            work.intersections += share * counted.intersections as f64;
             work.pixels += share * f64::from(view.width) * f64::from(view.height);
             work.tested += share * counted.tested as f64;
             work.seen += share * counted.seen as f64;
@@ -72,13 +72,13 @@ impl Work {
     pub fn markdown(&self) -> String {
         let per_pixel = |count: f64| format!("{:.1}", count / self.pixels.max(1.0));
         format!(
-            "| Gaussians | visible | instances | pixels | tested per pixel | past the cut | blended | blended of tested |\n\
+            "| Gaussians | visible | intersections | pixels | tested per pixel | past the cut | blended | blended of tested |\n\
              |--:|--:|--:|--:|--:|--:|--:|--:|\n\
              | {} | {:.0} | {:.0} | {:.0} | {} | {} | {} | {:.0} % |\n\n\
              Means over {} views.\n",
             self.gaussians,
             self.visible,
-            self.instances,
+            self.intersections,
             self.pixels,
             per_pixel(self.tested),
             per_pixel(self.seen),
@@ -181,6 +181,6 @@ mod tests {
         assert!(work.seen >= work.blended && work.seen <= seen * (1.0 + 1e-4));
         assert!(blended < 0.9 * seen, "{blended} {seen}: no pixel stops");
         assert!(work.tested >= work.seen);
-        assert!(work.visible > 0.0 && work.instances >= work.visible / 2.0);
+        assert!(work.visible > 0.0 && work.intersections >= work.visible / 2.0);
     }
 }

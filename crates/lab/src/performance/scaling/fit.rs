@@ -6,7 +6,7 @@ use serde::Serialize;
 
 use super::Point;
 
-/// Terms of the sum: a constant, Gaussians, instances, pixels.
+/// Terms of the sum: a constant, Gaussians, intersections, pixels.
 const TERMS: usize = 4;
 
 /// The terms of a point, and its bytes.
@@ -40,7 +40,7 @@ pub fn steepest(points: &[Point], size: fn(&Point) -> f64) -> Option<f64> {
     steepest
 }
 
-/// Peak memory as `constant + a Gaussians + b instances + c pixels`, by least squares of the
+/// Peak memory as `constant + a Gaussians + b intersections + c pixels`, by least squares of the
 /// relative error, none of them negative.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct MemoryFit {
@@ -49,7 +49,7 @@ pub struct MemoryFit {
     /// Bytes per Gaussian.
     pub per_gaussian: f64,
     /// Bytes per (tile, Gaussian) pair of a view.
-    pub per_instance: f64,
+    pub per_intersection: f64,
     /// Bytes per pixel of a view.
     pub per_pixel: f64,
     /// Largest relative difference of a point from the sum.
@@ -74,12 +74,12 @@ impl MemoryFit {
             usable.then(|| (squared_error(&rows, &solution), solution))
         });
         let (_, best) = fits.min_by(|a, b| a.0.total_cmp(&b.0))?;
-        let [constant, per_gaussian, per_instance, per_pixel] = best;
+        let [constant, per_gaussian, per_intersection, per_pixel] = best;
         // The terms can be told apart, and there is something left to check them with.
         (rows.len() > TERMS && least_squares(&rows, (1 << TERMS) - 1).is_some()).then(|| Self {
             constant,
             per_gaussian,
-            per_instance,
+            per_intersection,
             per_pixel,
             worst: errors(&rows, &best).fold(0.0, |worst, error| error.abs().max(worst)),
         })
@@ -87,7 +87,12 @@ impl MemoryFit {
 }
 
 fn terms(point: &Point) -> [f64; TERMS] {
-    [1.0, gaussians(point), point.work.instances, pixels(point)]
+    [
+        1.0,
+        gaussians(point),
+        point.work.intersections,
+        pixels(point),
+    ]
 }
 
 /// Relative differences of a sum from what it should be.
@@ -153,10 +158,10 @@ impl fmt::Display for MemoryFit {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(
             f,
-            "Peak memory = {:.0} MB + {:.0} bytes per Gaussian + {:.0} per instance + {:.0} per pixel, within {:.0} %.",
+            "Peak memory = {:.0} MB + {:.0} bytes per Gaussian + {:.0} per intersection + {:.0} per pixel, within {:.0} %.",
             1e-6 * self.constant,
             self.per_gaussian,
-            self.per_instance,
+            self.per_intersection,
             self.per_pixel,
             100.0 * self.worst
         )
@@ -168,12 +173,12 @@ mod tests {
     use super::*;
     use crate::performance::{Spread, Work};
 
-    fn point(gaussians: usize, instances: f64, pixels: f64, milliseconds: f64) -> Point {
-        let bytes = 5e7 + 900.0 * gaussians as f64 + 40.0 * instances + 100.0 * pixels;
+    fn point(gaussians: usize, intersections: f64, pixels: f64, milliseconds: f64) -> Point {
+        let bytes = 5e7 + 900.0 * gaussians as f64 + 40.0 * intersections + 100.0 * pixels;
         Point {
             work: Work {
                 gaussians,
-                instances,
+                intersections,
                 pixels,
                 ..Work::default()
             },
@@ -199,7 +204,7 @@ mod tests {
         let close = |a: f64, b: f64| assert!((a / b - 1.0).abs() < 1e-4, "{a} {b}");
         close(fit.constant, 5e7);
         close(fit.per_gaussian, 900.0);
-        close(fit.per_instance, 40.0);
+        close(fit.per_intersection, 40.0);
         close(fit.per_pixel, 100.0);
         assert!(fit.worst < 1e-6);
 
@@ -209,14 +214,14 @@ mod tests {
         // Instances take nothing here, and their count is off: no term may pay for it with bytes
         // below zero.
         let off = points.clone().map(|point| {
-            let bytes = 5e7 + 900.0 * gaussians(&point) - 9.0 * point.work.instances;
+            let bytes = 5e7 + 900.0 * gaussians(&point) - 9.0 * point.work.intersections;
             Point {
                 peak_rss_bytes: Some(bytes as u64),
                 ..point
             }
         });
         let fit = MemoryFit::of(&off).unwrap();
-        assert_eq!((fit.per_instance, fit.per_pixel), (0.0, 0.0));
+        assert_eq!((fit.per_intersection, fit.per_pixel), (0.0, 0.0));
         assert!((800.0..900.0).contains(&fit.per_gaussian), "{fit:?}");
 
         let unknown = points.map(|point| Point {

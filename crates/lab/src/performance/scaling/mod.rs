@@ -178,7 +178,7 @@ impl ScalingReport {
         )?;
         writeln!(
             text,
-            "| Gaussians | pixels | instances | tested per pixel | past the cut | blended | steps | median ms | min | max | peak MB |"
+            "| Gaussians | pixels | intersections | tested per pixel | past the cut | blended | steps | median ms | min | max | peak MB |"
         )?;
         writeln!(text, "|{}", "--:|".repeat(11))?;
         for point in &self.points {
@@ -191,7 +191,7 @@ impl ScalingReport {
                 "| {} | {:.0} | {:.0} | {:.1} | {:.1} | {:.1} | {} | {median:.1} | {min:.1} | {max:.1} | {} |",
                 work.gaussians,
                 work.pixels,
-                work.instances,
+                work.intersections,
                 per_pixel(work.tested),
                 per_pixel(work.seen),
                 per_pixel(work.blended),
