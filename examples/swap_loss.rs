@@ -18,8 +18,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args().skip(1);
     let folder = arguments.next().unwrap_or("examples/data/saharov".into());
     let steps = arguments.next().map_or(Ok(300), |steps| steps.parse())?;
-    let capture = Capture::load(folder, &CaptureOptions::new().with_downscale(2))?;
-    let config = TrainConfig::new().with_steps(steps);
+    let capture = Capture::load(folder, &CaptureSettings::new().with_downscale(2))?;
+    let config = TrainSettings::new().with_steps(steps);
     let loss = LossTerms::new()
         .term("charbonnier", 0.8, |view, rendered| {
             Ok(charbonnier(rendered.image() - view.image()))
@@ -29,7 +29,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
             Ok(charbonnier(along(1)) + charbonnier(along(2)))
         });
     let trained = Trainer::builder(capture.clone())
-        .config(config)
+        .settings(config)
         .device(Device::flex())
         .loss(loss)
         .on_progress(|p| match p.history.losses.last() {

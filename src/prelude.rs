@@ -5,7 +5,7 @@ pub use burn;
 pub use burn::module::{Module, Param};
 pub use burn::tensor::{Device, Int, Tensor, TensorData};
 
-pub use splat_data::{Camera, Capture, CaptureOptions, ImageSize, SceneScale, SplatData, View};
+pub use splat_data::{Camera, Capture, CaptureSettings, ImageSize, SceneScale, SplatData, View};
 pub use splat_model::{CameraTensors, Gaussians, RenderSettings, losses, render};
 pub use splat_ops::{OpError, Projected, Rendered, project, rasterize, sh_colors};
-pub use splat_trainer::{LossTerms, TargetView, TrainConfig, Trained, Trainer, evaluate};
+pub use splat_trainer::{LossTerms, TargetView, TrainSettings, Trained, Trainer, evaluate};

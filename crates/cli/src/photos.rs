@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use clap::Args;
 
 use super::{Failure, GlobalArgs};
-use splat_data::{Capture, CaptureOptions};
+use splat_data::{Capture, CaptureSettings};
 
 /// Options of commands that read a capture.
 #[derive(Debug, Clone, Default, Args)]
@@ -21,9 +21,9 @@ pub struct PhotoArgs {
 
 impl PhotoArgs {
     /// What was asked for, or the defaults.
-    pub(super) fn options(&self) -> CaptureOptions {
-        let default = CaptureOptions::default();
-        CaptureOptions {
+    pub(super) fn options(&self) -> CaptureSettings {
+        let default = CaptureSettings::default();
+        CaptureSettings {
             downscale: self.downscale.unwrap_or(default.downscale),
             images: self.images.clone(),
         }

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::Failure;
 use splat_data::text::utf8;
-use splat_trainer::train::TrainConfig;
+use splat_trainer::train::TrainSettings;
 
 /// Reads a file and what `parse` makes of its text, without a byte-order mark; errors name the
 /// file.
@@ -18,6 +18,6 @@ pub(super) fn read<T>(
 }
 
 /// Reads a run's settings.
-pub(super) fn read_config(path: &Path) -> Result<TrainConfig, Failure> {
-    read(path, |text| TrainConfig::parse(text.as_bytes()))
+pub(super) fn read_config(path: &Path) -> Result<TrainSettings, Failure> {
+    read(path, |text| TrainSettings::parse(text.as_bytes()))
 }

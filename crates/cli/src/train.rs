@@ -16,8 +16,8 @@ use super::{Failure, GlobalArgs, device, eval, interrupt, print, text};
 use crate::report::progress::Progress;
 use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
 use resume::Interrupted;
-use splat_data::{Capture, CaptureOptions};
-use splat_trainer::train::{Checkpoint, TrainConfig, Trainer, TrainerBuilder};
+use splat_data::{Capture, CaptureSettings};
+use splat_trainer::train::{Checkpoint, TrainSettings, Trainer, TrainerBuilder};
 
 /// The held-out views are measured this many times during a run, for the curves.
 const MEASUREMENTS: usize = 10;
@@ -88,11 +88,11 @@ impl TrainArgs {
         &self,
         resumed: Option<&Interrupted>,
         global: &GlobalArgs,
-    ) -> Result<TrainConfig, Failure> {
+    ) -> Result<TrainSettings, Failure> {
         let mut config = match (resumed, &self.config) {
-            (Some(run), _) => run.checkpoint.config().clone(),
+            (Some(run), _) => run.checkpoint.settings().clone(),
             (None, Some(path)) => text::read_config(path)?,
-            (None, None) => TrainConfig::default(),
+            (None, None) => TrainSettings::default(),
         };
         let Strategy::Adc = self.strategy;
         config.steps = self.steps.unwrap_or(config.steps);
@@ -137,7 +137,7 @@ impl TrainArgs {
 pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let resumed = args.resume.as_deref().map(Interrupted::open).transpose()?;
     let config = args.config(resumed.as_ref(), global)?;
-    let options = CaptureOptions {
+    let options = CaptureSettings {
         downscale: config.downscale,
         ..args.photos.options()
     };
@@ -175,7 +175,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     );
     let progress = Arc::new(Mutex::new(progress));
     let mut trainer = Trainer::builder(capture.clone())
-        .config(config.clone())
+        .settings(config.clone())
         .device(chosen.device.clone())
         .interrupt(interrupt::flag()?)
         .evaluate_every(config.steps.div_ceil(MEASUREMENTS));
@@ -251,7 +251,7 @@ fn shown(trainer: TrainerBuilder, progress: &Arc<Mutex<Progress>>) -> TrainerBui
 /// Says what of the settings is not as one might think.
 fn warn_of_settings(
     resumed: Option<&Interrupted>,
-    config: &TrainConfig,
+    config: &TrainSettings,
     points: usize,
     global: &GlobalArgs,
 ) {
@@ -278,7 +278,7 @@ fn warn_of_settings(
     let path = run.folder().join(CONFIG);
     let beside = path.is_file().then(|| text::read_config(&path));
     let difference = match &beside {
-        Some(Ok(beside)) => run.checkpoint.config().difference_in_words(beside),
+        Some(Ok(beside)) => run.checkpoint.settings().difference_in_words(beside),
         _ => None,
     };
     if let Some(difference) = difference {
@@ -295,7 +295,7 @@ fn config_text(
     args: &TrainArgs,
     global: &GlobalArgs,
     chosen: &ChosenDevice,
-    config: &TrainConfig,
+    config: &TrainSettings,
     changes: &[String],
 ) -> Result<String, Failure> {
     let repeat = args.images(CommandLine::new("train", global).path(&args.capture));

@@ -7,7 +7,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use splat_data::{Capture, CaptureOptions};
+use splat_data::{Capture, CaptureSettings};
 use tempfile::TempDir;
 
 fn splat(arguments: &[&str]) -> Output {
@@ -42,9 +42,9 @@ fn refusal(arguments: &[&str]) -> String {
 /// The example at an eighth of its size, its held-out views called `names`.
 fn small_example(into: &Path, names: [&str; 4]) -> PathBuf {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
-    let options = CaptureOptions {
+    let options = CaptureSettings {
         downscale: 8,
-        ..CaptureOptions::default()
+        ..CaptureSettings::default()
     };
     let mut capture = Capture::load(&source, &options).unwrap();
     for (&view, name) in capture.split.test.iter().zip(names) {

@@ -6,12 +6,12 @@ use std::path::Path;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use burn::tensor::Device;
-use splat_data::{Capture, CaptureOptions};
+use splat_data::{Capture, CaptureSettings};
 use splat_lab::performance::scaling::{PhotoSize, synthetic_capture};
 use splat_lab::performance::{PER_GAUSSIAN_AT_REST, device_step};
 use splat_ops::device::kernel_work;
 use splat_test_support::adapter_or_skip;
-use splat_trainer::{TrainConfig, Trained, Trainer};
+use splat_trainer::{TrainSettings, Trained, Trainer};
 
 static ALONE: Mutex<()> = Mutex::new(());
 
@@ -31,9 +31,9 @@ fn capture() -> Arc<Capture> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
     let mut capture = Capture::load(
         &folder,
-        &CaptureOptions {
+        &CaptureSettings {
             downscale: 16,
-            ..CaptureOptions::default()
+            ..CaptureSettings::default()
         },
     )
     .unwrap();
@@ -47,11 +47,11 @@ fn train(capture: &Arc<Capture>, device: &Device, seed: u64) -> Trained {
 }
 
 fn train_with(capture: &Arc<Capture>, device: &Device, seed: u64, deterministic: bool) -> Trained {
-    let mut config = TrainConfig {
+    let mut config = TrainSettings {
         steps: STEPS,
         seed,
         deterministic,
-        ..TrainConfig::default()
+        ..TrainSettings::default()
     };
     config.density.every = 4;
     config.density.reset_every = 8;
@@ -59,7 +59,7 @@ fn train_with(capture: &Arc<Capture>, device: &Device, seed: u64, deterministic:
     // More than such small photos ask for.
     config.density.max_gaussians = Some(10_000);
     Trainer::builder(capture.clone())
-        .config(config)
+        .settings(config)
         .device(device.clone())
         .build()
         .unwrap()
@@ -150,7 +150,7 @@ fn the_state_between_steps_takes_the_bytes_that_are_stated() {
     let Some((_alone, device)) = adapter() else {
         return;
     };
-    let config = TrainConfig::default();
+    let config = TrainSettings::default();
     let [small, large] = [1500, 4500].map(|gaussians| {
         let capture = Arc::new(synthetic_capture(gaussians, PhotoSize::of_pixels(3072)));
         let report = device_step::measure(&capture, &config, &device, 0.0, |_| {}).unwrap();

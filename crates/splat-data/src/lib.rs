@@ -13,7 +13,7 @@ mod scene_scale;
 pub mod text;
 
 pub use camera::Camera;
-pub use capture::{Capture, CaptureError, CaptureOptions, CaptureWarning, Point, Split, View};
+pub use capture::{Capture, CaptureError, CaptureSettings, CaptureWarning, Point, Split, View};
 pub use replace::{
     WriteError, probe_file, probe_files, probe_folder, write_atomically, write_durably,
 };

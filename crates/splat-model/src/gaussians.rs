@@ -12,6 +12,27 @@ use splat_data::{SceneSettings, SplatData};
 
 /// N Gaussians. Parameters are stored before their activation, as in 3DGS: scales as logarithms,
 /// opacities as logits.
+///
+/// ```
+/// use burn::tensor::Device;
+/// use splat_model::{CameraTensors, Gaussians, RenderSettings, SceneScale, render};
+/// use splat_model::{InitSettings, splats_from_points};
+///
+/// let device = Device::flex();
+/// let points = [[0.0, 0.0, 4.0], [0.5, 0.0, 5.0]];
+/// let scale = SceneScale::new(4.0).unwrap();
+/// let splats = splats_from_points(&points, &[[255, 0, 0], [0, 0, 255]], scale, &InitSettings::new())?;
+/// let gaussians = Gaussians::from_data(&splats, &device);
+/// let camera = splat_model::Camera {
+///     viewmat: glam::DMat4::IDENTITY,
+///     intrinsics: [50.0, 50.0, 32.0, 24.0],
+///     size: splat_model::ops::ImageSize { width: 64, height: 48 },
+/// };
+/// let camera = CameraTensors::from_camera(&camera, &device);
+/// let image = render(&gaussians, &camera, &RenderSettings::new())?.image();
+/// assert_eq!(image.dims(), [1, 48, 64, 3]);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 #[derive(Module, Debug)]
 pub struct Gaussians {
     /// Where in the world the means count from, see [`SplatData::origin`]. Cameras that look at the

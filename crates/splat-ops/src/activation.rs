@@ -9,6 +9,13 @@ use crate::settings::Activation;
 
 /// `exp(x)`, of logarithms of scales for example. The same function as [`Tensor::exp`], to 2 units
 /// in the last place on every device; on the CPU in SIMD and parallel.
+///
+/// ```
+/// use burn::tensor::{Device, Tensor};
+///
+/// let x = Tensor::<1>::zeros([1], &Device::flex());
+/// assert_eq!(splat_ops::exp(x).into_scalar::<f32>(), 1.0);
+/// ```
 pub fn exp<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     activate(x, Activation::Exp)
 }
@@ -18,6 +25,13 @@ pub fn exp<const D: usize>(x: Tensor<D>) -> Tensor<D> {
 /// Its gradient is computed from x, as `e / (1 + e)^2` with `e = exp(-|x|)`. Burn's own takes it
 /// from the output, as `o (1 - o)`, which is exactly zero once o rounds to one (from a logit of 17
 /// on in single precision): a Gaussian could never become transparent again.
+///
+/// ```
+/// use burn::tensor::{Device, Tensor};
+///
+/// let x = Tensor::<1>::zeros([1], &Device::flex());
+/// assert_eq!(splat_ops::sigmoid(x).into_scalar::<f32>(), 0.5);
+/// ```
 pub fn sigmoid<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     activate(x, Activation::Sigmoid)
 }

@@ -16,6 +16,28 @@ use crate::settings::AdamStep;
 /// A gradient whose square is not finite counts as zero: one NaN would stay in the moments for
 /// good.
 ///
+/// ```
+/// use burn::tensor::{Device, Tensor};
+/// use splat_ops::{AdamRows, AdamStep, adam_step};
+///
+/// let ones = Tensor::<1>::ones([2], &Device::flex());
+/// let moments = [ones.zeros_like(), ones.zeros_like()];
+/// // The first step of a rate of 0.1, with the bias corrections in it.
+/// let (beta_1, beta_2) = (0.9, 0.999f64);
+/// let correction = (1.0 - beta_2).sqrt();
+/// let step = AdamStep {
+///     beta_1,
+///     beta_2,
+///     rate: 0.1 * correction / (1.0 - beta_1),
+///     epsilon: 1e-15 * correction,
+///     rows: AdamRows::All,
+/// };
+/// let (stepped, _) = adam_step(ones.clone(), ones, moments, &step)?;
+/// let stepped: Vec<f32> = stepped.into_data().try_into_vec().unwrap();
+/// assert!((stepped[0] - 0.9).abs() < 1e-6);
+/// # Ok::<(), splat_ops::OpError>(())
+/// ```
+///
 /// # Errors
 /// When shapes, types or devices differ.
 pub fn adam_step<const D: usize>(

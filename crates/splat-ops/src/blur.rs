@@ -11,6 +11,16 @@ use crate::check::Checker;
 /// Convolves the rows and columns of images `[B, H, W, D]` with one symmetric window, taking zero
 /// outside of the image. Differentiable in the image; being self-adjoint, it is its own gradient.
 ///
+/// ```
+/// use burn::tensor::{Device, Tensor};
+///
+/// let image = Tensor::<4>::ones([1, 5, 5, 1], &Device::flex());
+/// let blurred = splat_ops::gaussian_blur(image, &[0.25, 0.5, 0.25])?;
+/// let values: Vec<f32> = blurred.into_data().try_into_vec().unwrap();
+/// assert_eq!((values[12], values[0]), (1.0, 0.75 * 0.75)); // zeros outside of the image
+/// # Ok::<(), splat_ops::OpError>(())
+/// ```
+///
 /// # Errors
 /// When the window's length is even or it is not symmetric.
 pub fn gaussian_blur(image: Tensor<4>, window: &[f64]) -> Result<Tensor<4>, OpError> {

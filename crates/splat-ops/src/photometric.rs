@@ -67,6 +67,21 @@ impl Photometric {
 /// Differentiable in the images; other channels than the first D have a gradient of zero. The
 /// target is a constant.
 ///
+/// ```
+/// use burn::tensor::{Device, Int, Tensor};
+/// use splat_ops::{SsimArgs, photometric};
+///
+/// let device = Device::flex().autodiff();
+/// let rendered = Tensor::<4>::full([1, 16, 16, 3], 0.5, &device).require_grad();
+/// let photo = Tensor::<4, Int>::full([1, 16, 16, 3], 255, &device);
+/// let args = SsimArgs { window: vec![0.25, 0.5, 0.25], c1: 1e-4, c2: 9e-4 };
+/// let measured = photometric(rendered.clone(), photo, &args)?;
+/// assert_eq!(measured.l1().into_scalar::<f32>(), 0.5);
+/// let loss = measured.l1() * 0.8 + (-measured.ssim() + 1.0) * 0.2;
+/// assert!(rendered.grad(&loss.backward()).is_some());
+/// # Ok::<(), splat_ops::OpError>(())
+/// ```
+///
 /// # Errors
 /// When shapes, types or devices do not fit, the target is tracked by autodiff, or the window's
 /// length is even or it is not symmetric.

@@ -112,6 +112,28 @@ impl Projected {
 /// gradient) when their depth is outside [near, far], when they do not reach the image, when their
 /// quaternion has no length, or when one of their fields is not finite.
 ///
+/// ```
+/// use burn::tensor::{Device, Tensor};
+/// use splat_ops::{ImageSize, ProjectSettings, project};
+///
+/// let device = Device::flex().autodiff();
+/// let means = Tensor::<2>::from_floats([[0.0, 0.0, 4.0]], &device).require_grad();
+/// let projected = project(
+///     means.clone(),
+///     Tensor::from_floats([[1.0, 0.0, 0.0, 0.0]], &device), // quats
+///     Tensor::from_floats([[0.1, 0.1, 0.1]], &device),      // scales
+///     Tensor::<2>::eye(4, &device).unsqueeze(),             // viewmats
+///     Tensor::from_floats([[50.0, 50.0, 32.0, 24.0]], &device),
+///     ImageSize { width: 64, height: 48 },
+///     &ProjectSettings::default(),
+/// )?;
+/// let mean2d: Vec<f32> = projected.means2d().into_data().try_into_vec().unwrap();
+/// assert_eq!(mean2d, [32.0, 24.0]);
+/// let gradient = means.grad(&projected.means2d().sum().backward()).unwrap();
+/// assert_eq!(gradient.into_data().try_into_vec::<f32>().unwrap()[0], 50.0 / 4.0);
+/// # Ok::<(), splat_ops::OpError>(())
+/// ```
+///
 /// # Errors
 /// When shapes, types or devices do not fit, or the image has no pixels.
 pub fn project(

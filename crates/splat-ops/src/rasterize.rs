@@ -72,6 +72,24 @@ impl Rendered {
 /// fall below `transmittance_min`. Every splat that was blended gets gradients, to screen mean,
 /// inverse Cholesky factor, colour and opacity; depth and extent only order and cull.
 ///
+/// ```
+/// use burn::tensor::{Device, Tensor};
+/// use splat_ops::{ImageSize, Projected, RasterizeSettings, rasterize};
+///
+/// let device = Device::flex();
+/// // One round splat in the middle: mean, depth, 1 / sigma twice, compensation, extents.
+/// let packed = [[[8.0, 8.0, 1.0, 0.5, 0.0, 0.5, 1.0, 6.0, 6.0]]];
+/// let size = ImageSize { width: 16, height: 16 };
+/// let splats = Projected::from_packed(Tensor::from_floats(packed, &device), size)?;
+/// let colors = Tensor::<2>::from_floats([[1.0, 0.5, 0.0]], &device);
+/// let opacities = Tensor::<1>::from_floats([0.8], &device);
+/// let rendered = rasterize(&splats, colors, opacities, None, &RasterizeSettings::default())?;
+/// assert_eq!(rendered.image().dims(), [1, 16, 16, 3]);
+/// let middle = rendered.alpha().slice([0..1, 7..8, 7..8, 0..1]).into_scalar::<f32>();
+/// assert!((middle - 0.8 * (-0.0625f32).exp()).abs() < 1e-6);
+/// # Ok::<(), splat_ops::OpError>(())
+/// ```
+///
 /// # Errors
 /// When shapes, types or devices do not fit, when a setting is out of range, when the splats touch
 /// more tiles than one call can list ([`OpError::TooManyIntersections`]), and when the device

@@ -31,6 +31,19 @@ use crate::{OpError, Projected, SH_DEGREE_MAX, ShColorSettings, sh_coefficient_c
 /// [`ClampGradient::Recovering`](crate::ClampGradient::Recovering) is asked for; one that is
 /// exactly zero does.
 ///
+/// ```
+/// use burn::tensor::{Device, Tensor};
+/// use splat_ops::sh_colors;
+///
+/// let device = Device::flex();
+/// let sh0 = Tensor::<3>::zeros([2, 1, 3], &device);
+/// let means = Tensor::<2>::ones([2, 3], &device);
+/// let centers = Tensor::<2>::zeros([1, 3], &device);
+/// let colors = sh_colors(sh0, None, means, centers, 0, None)?;
+/// assert_eq!(colors.dims(), [1, 2, 3]); // mid-grey
+/// # Ok::<(), splat_ops::OpError>(())
+/// ```
+///
 /// # Errors
 /// When the degree is above 3, or shapes, types or devices do not fit.
 pub fn sh_colors(

@@ -21,6 +21,19 @@ use crate::check::Checker;
 /// Returns the plain sum `[C, N, 3]`, in the basis and with the constants of 3DGS. The model adds
 /// 0.5 and clamps at zero.
 ///
+/// ```
+/// use burn::tensor::{Device, Tensor};
+/// use splat_ops::spherical_harmonics;
+///
+/// let device = Device::flex();
+/// let coeffs = Tensor::<3>::ones([1, 4, 3], &device);
+/// let dirs = Tensor::<3>::from_floats([[[0.0, 0.0, 2.0]]], &device);
+/// let sum = spherical_harmonics(coeffs, dirs, 1)?; // [C, N, 3]
+/// let red = sum.into_data().try_into_vec::<f32>().unwrap()[0];
+/// assert!((red - (0.28209479 + 0.48860251)).abs() < 1e-6);
+/// # Ok::<(), splat_ops::OpError>(())
+/// ```
+///
 /// # Errors
 /// When the degree is above 3, or shapes, types or devices do not fit.
 pub fn spherical_harmonics(

@@ -20,6 +20,17 @@ use crate::settings::SsimArgs;
 ///
 /// where m and E are means under the window. Differentiable in both images.
 ///
+/// ```
+/// use burn::tensor::{Device, Tensor};
+/// use splat_ops::{SsimArgs, ssim_map};
+///
+/// let image = Tensor::<4>::ones([1, 8, 8, 3], &Device::flex());
+/// let args = SsimArgs { window: vec![0.25, 0.5, 0.25], c1: 1e-4, c2: 9e-4 };
+/// let map = ssim_map(image.clone(), image, &args)?;
+/// assert!(map.into_data().try_into_vec::<f32>().unwrap().iter().all(|s| (s - 1.0).abs() < 1e-5));
+/// # Ok::<(), splat_ops::OpError>(())
+/// ```
+///
 /// # Errors
 /// When shapes, types or devices differ, or the window's length is even or it is not symmetric.
 pub fn ssim_map(x: Tensor<4>, y: Tensor<4>, args: &SsimArgs) -> Result<Tensor<4>, OpError> {

@@ -10,8 +10,8 @@ use splat_model::{
     CameraTensors, RenderSettings, SplatModel, project_gaussians, render_projected_on,
 };
 
+use crate::hooks::{HookView, Hooks, Purpose};
 use crate::photo::photo;
-use crate::train::{HookView, Hooks, Purpose};
 
 /// Scores of one view.
 #[derive(Debug, Clone, PartialEq, Serialize)]

@@ -8,8 +8,8 @@ use std::sync::{Arc, Mutex, OnceLock};
 use burn::tensor::Device;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use splat_data::{Capture, CaptureOptions};
-use splat_trainer::{TrainConfig, Trained, Trainer, Warning};
+use splat_data::{Capture, CaptureSettings};
+use splat_trainer::{TrainSettings, Trained, Trainer, Warning};
 
 /// The training view that some of the tests spoil.
 const SPOILED: usize = 5;
@@ -18,9 +18,9 @@ fn load(downscale: u32) -> Capture {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
     Capture::load(
         &folder,
-        &CaptureOptions {
+        &CaptureSettings {
             downscale,
-            ..CaptureOptions::default()
+            ..CaptureSettings::default()
         },
     )
     .unwrap()
@@ -34,20 +34,20 @@ fn capture() -> Capture {
     capture
 }
 
-fn config() -> TrainConfig {
-    TrainConfig {
+fn config() -> TrainSettings {
+    TrainSettings {
         steps: 500,
-        ..TrainConfig::default()
+        ..TrainSettings::default()
     }
 }
 
 /// Trains to the end, checks the parameters, and returns what was warned of.
-fn train(what: &str, capture: Capture, config: TrainConfig) -> Vec<Warning> {
+fn train(what: &str, capture: Capture, config: TrainSettings) -> Vec<Warning> {
     let heard = Arc::new(Mutex::new(Vec::new()));
     let hear = heard.clone();
     let steps = config.steps;
     let trained = Trainer::builder(capture)
-        .config(config)
+        .settings(config)
         .device(Device::flex())
         .on_warning(move |warning| hear.lock().unwrap().push(warning.clone()))
         .build()
@@ -113,7 +113,7 @@ fn moved(mut viewmat: [[f64; 4]; 4], to: [f64; 3]) -> [[f64; 4]; 4] {
 fn a_good_start_gives_no_warning() {
     assert_eq!(train("good", capture(), config()), []);
     // As `splat train` has it, at a quarter of the size.
-    let config = TrainConfig {
+    let config = TrainSettings {
         steps: 300,
         ..config()
     };
@@ -258,7 +258,7 @@ fn black_points_learn_their_colours() {
             }
         }
         let trained = Trainer::builder(capture)
-            .config(TrainConfig {
+            .settings(TrainSettings {
                 steps: 1_500,
                 ..config()
             })
@@ -291,7 +291,7 @@ fn black_points_learn_their_colours() {
 
 #[test]
 fn an_opacity_that_nothing_could_bring_back_is_refused() {
-    type Change = fn(&mut TrainConfig);
+    type Change = fn(&mut TrainSettings);
     let changes: [(&str, Change); 3] = [
         ("init.opacity", |c| c.init.opacity = 0.003),
         ("density.reset_opacity", |c| c.density.reset_opacity = 0.003),

@@ -5,9 +5,9 @@ use std::path::Path;
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor};
-use splat_data::{Capture, CaptureOptions, View};
+use splat_data::{Capture, CaptureSettings, View};
 use splat_model::{CameraTensors, SceneScale, render};
-use splat_trainer::{TrainConfig, Trainer, evaluate};
+use splat_trainer::{TrainSettings, Trainer, evaluate};
 
 /// From a micrometre to a thousand kilometres, and two that are no powers of ten.
 const UNITS: [f64; 6] = [1e-6, 0.002, 0.37, 25.4, 1e3, 1e6];
@@ -15,9 +15,9 @@ const UNITS: [f64; 6] = [1e-6, 0.002, 0.37, 25.4, 1e3, 1e6];
 /// The example capture at 118 x 79 pixels in a unit that is `1 / unit` times as large.
 fn capture(unit: f64) -> Arc<Capture> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
-    let options = CaptureOptions {
+    let options = CaptureSettings {
         downscale: 4,
-        ..CaptureOptions::default()
+        ..CaptureSettings::default()
     };
     let mut capture = Capture::load(&folder, &options).unwrap();
     for view in &mut capture.views {
@@ -32,13 +32,13 @@ fn capture(unit: f64) -> Arc<Capture> {
 }
 
 fn trainer(capture: &Arc<Capture>, seed: u64) -> Trainer {
-    let config = TrainConfig {
+    let config = TrainSettings {
         steps: 200,
         seed,
-        ..TrainConfig::default()
+        ..TrainSettings::default()
     };
     Trainer::builder(capture.clone())
-        .config(config)
+        .settings(config)
         .device(Device::flex())
         .build()
         .unwrap()
@@ -62,7 +62,7 @@ fn first_step(unit: f64) -> Vec<(&'static str, Vec<f32>, i32)> {
     let capture = capture(unit);
     let trainer = trainer(&capture, 0);
     let gaussians = trainer.model();
-    let settings = TrainConfig::default().render_settings(0, trainer.scene_scale());
+    let settings = TrainSettings::default().render_settings(0, trainer.scene_scale());
     let camera = capture.views[3].camera().relative_to(gaussians.origin);
     let camera = CameraTensors::from_camera(&camera, &gaussians.means.device());
     let image = render(gaussians, &camera, &settings).unwrap().image();

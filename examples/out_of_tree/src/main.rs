@@ -16,15 +16,15 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut arguments = std::env::args().skip(1);
     let folder = arguments.next().unwrap_or("../data/saharov".into());
     let steps = arguments.next().map_or(Ok(200), |steps| steps.parse())?;
-    let capture = Capture::load(folder, &CaptureOptions::new().with_downscale(4))?;
+    let capture = Capture::load(folder, &CaptureSettings::new().with_downscale(4))?;
     let device = Device::flex();
-    let config = TrainConfig::new().with_steps(steps);
+    let config = TrainSettings::new().with_steps(steps);
     // A loss is a closure on tensors, or a list of named and weighted ones.
     let loss = LossTerms::l1_ssim(0.2).term("opaque", 0.01, |_, rendered| {
-        Ok((1.0 - rendered.alpha()).mean())
+        Ok((-rendered.alpha() + 1.0).mean())
     });
     let trained = Trainer::builder(capture.clone())
-        .config(config)
+        .settings(config)
         .device(device.clone())
         .loss(loss)
         .hook(Exposure::new(capture.split.train.len(), &device)?)

@@ -11,7 +11,7 @@ use rand_pcg::Pcg64Mcg;
 use serde_json::{Value, json};
 use splat_trainer::train::Checkpoint;
 use splat_trainer::train::expected_checksum;
-use splat_trainer::{TrainConfig, Trainer};
+use splat_trainer::{TrainSettings, Trainer};
 
 use super::{
     Follow, Input, Target, capture, mutate_json, per_byte, safetensors as file, train_steps,
@@ -32,10 +32,10 @@ const META: &str = "burn_splat";
 const CHECKSUM: &str = "burn_splat_checksum";
 
 /// Few Gaussians, and density control at every step.
-fn config(steps: usize) -> TrainConfig {
-    let mut config = TrainConfig {
+fn config(steps: usize) -> TrainSettings {
+    let mut config = TrainSettings {
         steps,
-        ..TrainConfig::default()
+        ..TrainSettings::default()
     };
     config.init.sh_degree = 1;
     config.density.every = 1;
@@ -50,7 +50,7 @@ fn seeds() -> Vec<Input> {
     let kept = Arc::new(Mutex::new(vec![]));
     let keep = kept.clone();
     let trainer = Trainer::builder(capture())
-        .config(config(8))
+        .settings(config(8))
         .device(Device::flex())
         .autosave(Duration::ZERO, move |checkpoint| {
             keep.lock().expect("one thread").push(checkpoint.clone());

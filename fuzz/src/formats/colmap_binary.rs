@@ -6,7 +6,7 @@ use std::sync::Arc;
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use splat_data::capture::in_memory::parse as parse_capture;
-use splat_trainer::TrainConfig;
+use splat_trainer::TrainSettings;
 
 use super::colmap::Model;
 use super::{Follow, Input, Target, per_byte, train_steps};
@@ -31,9 +31,9 @@ pub(super) fn parse(binary: bool, input: &Input) -> Result<Follow, String> {
     let files = [0, 1, 2].map(|part| input.0[part].as_slice());
     let capture = parse_capture(binary, files).map_err(|error| error.to_string())?;
     Ok(Box::new(move || {
-        let config = TrainConfig {
+        let config = TrainSettings {
             steps: 4,
-            ..TrainConfig::default()
+            ..TrainSettings::default()
         };
         train_steps(Arc::new(capture), config, None)
     }))

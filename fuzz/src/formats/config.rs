@@ -1,7 +1,7 @@
 //! Settings of a run, as TOML.
 
 use rand_pcg::Pcg64Mcg;
-use splat_trainer::TrainConfig;
+use splat_trainer::TrainSettings;
 
 use super::{Follow, Input, Target, capture, per_byte, train_steps};
 use crate::mutate;
@@ -44,21 +44,21 @@ const WORDS: [&str; 24] = [
 ];
 
 fn seeds() -> Vec<Input> {
-    let default = TrainConfig {
+    let default = TrainSettings {
         background: Some([0.1, 0.2, 0.3]),
         steps: 8,
-        ..TrainConfig::default()
+        ..TrainSettings::default()
     };
-    let mut busy = TrainConfig {
+    let mut busy = TrainSettings {
         steps: 4,
         coarse_halvings: 1,
         antialias: true,
-        ..TrainConfig::default()
+        ..TrainSettings::default()
     };
     busy.density.every = 1;
     busy.density.reset_every = 1;
     busy.density.max_gaussians = Some(100);
-    let text = |config: &TrainConfig| toml::to_string(config).expect("settings are TOML");
+    let text = |config: &TrainSettings| toml::to_string(config).expect("settings are TOML");
     let texts = [
         format!(
             "# splat 0.1.0 on a device; to repeat: ...\n{}",
@@ -72,7 +72,7 @@ fn seeds() -> Vec<Input> {
 
 /// Reads settings; what is let through begins a run.
 fn parse(input: &Input) -> Result<Follow, String> {
-    let config = TrainConfig::parse(&input.0[0]);
+    let config = TrainSettings::parse(&input.0[0]);
     // As the program says it, with the file before it.
     let config = config.map_err(|reason| format!("config.toml: {reason}"))?;
     Ok(Box::new(move || train_steps(capture(), config, None)))

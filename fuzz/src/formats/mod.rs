@@ -15,7 +15,7 @@ use burn::tensor::Device;
 use rand_pcg::Pcg64Mcg;
 use splat_data::Capture;
 use splat_trainer::train::Checkpoint;
-use splat_trainer::{TrainConfig, Trainer};
+use splat_trainer::{TrainSettings, Trainer};
 
 /// What is run: the content of one file, or of several that belong together.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
@@ -90,9 +90,13 @@ fn capture() -> Arc<Capture> {
 }
 
 /// Takes some steps of a run, and says whether it could: refusing is fine.
-fn train_steps(capture: Arc<Capture>, config: TrainConfig, checkpoint: Option<Checkpoint>) -> bool {
+fn train_steps(
+    capture: Arc<Capture>,
+    config: TrainSettings,
+    checkpoint: Option<Checkpoint>,
+) -> bool {
     let mut trainer = Trainer::builder(capture)
-        .config(config)
+        .settings(config)
         .device(Device::flex());
     if let Some(checkpoint) = checkpoint {
         trainer = trainer.resume(checkpoint);

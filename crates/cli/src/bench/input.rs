@@ -8,7 +8,7 @@ use clap::Args;
 use super::{Failure, GlobalArgs};
 use crate::photos::PhotoArgs;
 use splat_data::Capture;
-use splat_trainer::train::TrainConfig;
+use splat_trainer::train::TrainSettings;
 
 /// The capture that the project carries.
 pub(super) const EXAMPLE: &str = "examples/data/saharov";
@@ -37,11 +37,11 @@ impl CaptureArgs {
     }
 
     /// The usual settings, but for what was asked for.
-    pub(super) fn config(&self, global: &GlobalArgs) -> TrainConfig {
-        TrainConfig {
+    pub(super) fn config(&self, global: &GlobalArgs) -> TrainSettings {
+        TrainSettings {
             downscale: self.photos.options().downscale,
             seed: global.seed.unwrap_or_default(),
-            ..TrainConfig::default()
+            ..TrainSettings::default()
         }
     }
 

@@ -84,7 +84,7 @@ pub(super) fn report(
         None => {
             let config = input.config(global);
             let trainer = Trainer::builder(capture.clone())
-                .config(config.clone())
+                .settings(config.clone())
                 .device(device.clone())
                 .build()?;
             let name = format!("the first Gaussians of {}", capture.name);

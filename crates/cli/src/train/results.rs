@@ -21,7 +21,7 @@ use crate::report::view_names::ViewNames;
 use crate::report::{ReportError, probe_file, probe_folder, refuse_inputs, write_durably};
 use splat_data::{Capture, View, WriteError};
 use splat_lab::memory::peak_rss_bytes;
-use splat_trainer::train::{CheckpointError, History, TrainConfig, Trained};
+use splat_trainer::train::{CheckpointError, History, TrainSettings, Trained};
 use splat_trainer::{Scores, evaluate};
 
 /// The scene's file.
@@ -124,7 +124,7 @@ impl RunFolder<'_> {
         &self,
         trained: &Trained,
         capture: &Capture,
-        config: &TrainConfig,
+        config: &TrainSettings,
         chosen: &ChosenDevice,
     ) -> (Option<Scores>, Result<(), Failure>) {
         let mut saving = Saving::default();
@@ -272,7 +272,7 @@ impl RunFolder<'_> {
 fn metrics(
     scores: &Scores,
     trained: &Trained,
-    config: &TrainConfig,
+    config: &TrainSettings,
     chosen: &ChosenDevice,
 ) -> Metrics {
     let seconds = |time: Duration| time.as_secs_f64();

@@ -16,7 +16,7 @@ use super::stages::Recording;
 use super::step::{Samples, StageColumn, at_degree, trainer, work_on, write_stages};
 use super::{Machine, PerformanceError, Spread, Work};
 use splat_data::Capture;
-use splat_trainer::TrainConfig;
+use splat_trainer::TrainSettings;
 
 /// Steps before the clock starts: kernels are compiled, and spherical harmonics reach their degree.
 const WARM_UP: usize = 5;
@@ -98,7 +98,7 @@ fn is_software(_: &Device) -> bool {
 /// When the capture cannot be trained on, or the device is none of CubeCL or fails.
 pub fn measure(
     capture: &Arc<Capture>,
-    config: &TrainConfig,
+    config: &TrainSettings,
     device: &Device,
     seconds: f64,
     mut say: impl FnMut(&str),
@@ -149,7 +149,7 @@ pub(super) struct DeviceRun {
 /// Takes `warm_up` steps and then measures some more.
 pub(super) fn run(
     capture: &Arc<Capture>,
-    config: &TrainConfig,
+    config: &TrainSettings,
     device: &Device,
     warm_up: usize,
     seconds: f64,

@@ -15,7 +15,7 @@ use super::{Machine, PerformanceError, Spread, Work, all_threads, on_threads, st
 use crate::memory::peak_rss_bytes;
 use splat_data::Capture;
 use splat_data::View;
-use splat_trainer::{TrainConfig, Trainer};
+use splat_trainer::{TrainSettings, Trainer};
 
 /// Steps before the clock starts: caches and the allocator fill, spherical harmonics reach their
 /// degree.
@@ -71,7 +71,7 @@ pub struct StepRow {
 /// When the capture cannot be trained on.
 pub fn measure(
     capture: &Arc<Capture>,
-    config: &TrainConfig,
+    config: &TrainSettings,
     seconds: f64,
     mut say: impl FnMut(&str),
 ) -> Result<StepReport, PerformanceError> {
@@ -110,9 +110,9 @@ pub fn measure(
 
 /// A run of the usual length that evaluates spherical harmonics of degree 0, or of 3 from the
 /// fourth step on.
-pub(super) fn at_degree(config: &TrainConfig, sh_degree: usize) -> TrainConfig {
-    let usual = TrainConfig::default();
-    TrainConfig {
+pub(super) fn at_degree(config: &TrainSettings, sh_degree: usize) -> TrainSettings {
+    let usual = TrainSettings::default();
+    TrainSettings {
         steps: usual.steps,
         sh_degree_every: if sh_degree == 0 { usual.steps } else { 1 },
         ..config.clone()
@@ -120,14 +120,17 @@ pub(super) fn at_degree(config: &TrainConfig, sh_degree: usize) -> TrainConfig {
 }
 
 /// The work of the first Gaussians of a capture on the CPU.
-pub(super) fn work(capture: &Arc<Capture>, config: &TrainConfig) -> Result<Work, PerformanceError> {
+pub(super) fn work(
+    capture: &Arc<Capture>,
+    config: &TrainSettings,
+) -> Result<Work, PerformanceError> {
     work_on(capture, config, &Device::flex())
 }
 
 /// The work of the first Gaussians of a capture, as the ops of `device` do it.
 pub(super) fn work_on(
     capture: &Arc<Capture>,
-    config: &TrainConfig,
+    config: &TrainSettings,
     device: &Device,
 ) -> Result<Work, PerformanceError> {
     let trainer = trainer(capture, config, device)?;
@@ -139,11 +142,11 @@ pub(super) fn work_on(
 
 pub(super) fn trainer(
     capture: &Arc<Capture>,
-    config: &TrainConfig,
+    config: &TrainSettings,
     device: &Device,
 ) -> Result<Trainer, PerformanceError> {
     Ok(Trainer::builder(capture.clone())
-        .config(config.clone())
+        .settings(config.clone())
         .device(device.clone())
         .build()?)
 }
@@ -223,7 +226,7 @@ fn label(span: &str) -> String {
 /// Takes `warm_up` steps and then measures up to `steps` more.
 pub(super) fn run(
     capture: &Arc<Capture>,
-    config: &TrainConfig,
+    config: &TrainSettings,
     warm_up: usize,
     steps: usize,
 ) -> Result<Samples, PerformanceError> {
@@ -368,17 +371,17 @@ pub(super) fn write_stages(text: &mut String, columns: &[StageColumn]) -> std::f
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splat_data::CaptureOptions;
+    use splat_data::CaptureSettings;
 
     #[test]
     fn stages_cover_the_step_and_its_work_is_counted() {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
-        let options = CaptureOptions {
+        let options = CaptureSettings {
             downscale: 16,
-            ..CaptureOptions::default()
+            ..CaptureSettings::default()
         };
         let capture = Arc::new(Capture::load(folder, &options).unwrap());
-        let config = at_degree(&TrainConfig::default(), 3);
+        let config = at_degree(&TrainSettings::default(), 3);
         let samples = on_threads(1, || run(&capture, &config, 1, 3)).unwrap();
         assert_eq!(samples.steps.len(), 3);
         for (seconds, stages) in &samples.steps {

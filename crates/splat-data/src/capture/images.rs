@@ -11,7 +11,7 @@ use rayon::prelude::*;
 use splat_core::memory::available_memory;
 
 use super::sparse_model::{SparseCamera, SparseImage, SparseModel};
-use super::{CaptureError, CaptureOptions, CaptureWarning, View, downscale, jpeg};
+use super::{CaptureError, CaptureSettings, CaptureWarning, View, downscale, jpeg};
 
 /// Least width and height of a photo: the window of SSIM.
 pub(super) const MIN_SIDE: u32 = 11;
@@ -20,7 +20,7 @@ pub(super) const MIN_SIDE: u32 = 11;
 pub(super) fn folder(
     root: &Path,
     model: &SparseModel,
-    options: &CaptureOptions,
+    options: &CaptureSettings,
 ) -> Result<PathBuf, CaptureError> {
     folders::of_photos(root, options.images.as_deref(), model)
 }
@@ -30,7 +30,7 @@ pub(super) fn load(
     root: &Path,
     folder: &Path,
     model: &SparseModel,
-    options: &CaptureOptions,
+    options: &CaptureSettings,
     warnings: &mut Vec<CaptureWarning>,
 ) -> Result<Vec<View>, CaptureError> {
     // Look for every photo before decoding any: the likeliest mistake is found at once.

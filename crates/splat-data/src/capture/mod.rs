@@ -87,7 +87,7 @@ pub struct Point {
 /// How to read a capture.
 #[derive(Debug, Clone, PartialEq, Eq, Setters)]
 #[setters(prefix = "with_", strip_option)]
-pub struct CaptureOptions {
+pub struct CaptureSettings {
     /// Area-average every photo by this factor, at least 1 (1: as it is). Default 1.
     pub downscale: u32,
     /// Folder of the photos, relative to the capture's or absolute. Default: `images`, or the
@@ -95,14 +95,14 @@ pub struct CaptureOptions {
     pub images: Option<PathBuf>,
 }
 
-impl CaptureOptions {
+impl CaptureSettings {
     /// The defaults; `with_*` methods change them one by one.
     pub fn new() -> Self {
         Self::default()
     }
 }
 
-impl Default for CaptureOptions {
+impl Default for CaptureSettings {
     fn default() -> Self {
         Self {
             downscale: 1,
@@ -115,7 +115,7 @@ impl Capture {
     /// Reads the capture in the folder `root`.
     ///
     /// The COLMAP model is looked for in `sparse/0`, then `sparse`, then `root` itself, binary
-    /// before text; the photos in [`CaptureOptions::images`]. Cameras must be `PINHOLE` or
+    /// before text; the photos in [`CaptureSettings::images`]. Cameras must be `PINHOLE` or
     /// `SIMPLE_PINHOLE`. Photos are decoded in parallel; where a photo's size is a uniform rescale
     /// of its camera's, the intrinsics follow the photo and a warning says so. A photo of which a
     /// part is missing is refused. The held-out views are those `split.json` names, or else every
@@ -125,11 +125,20 @@ impl Capture {
     /// (while it is read); the pixels of the photos come on top, three bytes each, and up to twelve
     /// while a photo is decoded.
     ///
+    /// ```
+    /// use splat_data::{Capture, CaptureSettings};
+    ///
+    /// # let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
+    /// let capture = Capture::load(folder, &CaptureSettings::new().with_downscale(16))?;
+    /// println!("{} photos, {} points", capture.views.len(), capture.points.len());
+    /// # Ok::<(), splat_data::CaptureError>(())
+    /// ```
+    ///
     /// # Errors
     ///
     /// Whatever makes the capture unusable, see [`CaptureError`]. A capture of a single photo is
     /// read: whether there is anything to train on is for [`Capture::check_trainable`].
-    pub fn load(root: impl AsRef<Path>, options: &CaptureOptions) -> Result<Self, CaptureError> {
+    pub fn load(root: impl AsRef<Path>, options: &CaptureSettings) -> Result<Self, CaptureError> {
         let root = root.as_ref();
         if options.downscale == 0 {
             return Err(CaptureError::ZeroDownscale);
@@ -210,7 +219,7 @@ impl View {
         }
     }
 
-    /// The view with its photo area-averaged by `factor`, as [`CaptureOptions::downscale`] has it,
+    /// The view with its photo area-averaged by `factor`, as [`CaptureSettings::downscale`] has it,
     /// or by the largest power of two below it that leaves both sides at least as long as SSIM's
     /// window.
     pub fn downscaled(&self, factor: u32) -> Self {

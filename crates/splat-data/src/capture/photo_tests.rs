@@ -21,13 +21,13 @@ fn good() -> (TempDir, TestCapture) {
 }
 
 fn load(root: &Path) -> Result<Capture, CaptureError> {
-    Capture::load(root, &CaptureOptions::default())
+    Capture::load(root, &CaptureSettings::default())
 }
 
 fn load_from(root: &Path, images: &Path) -> Result<Capture, CaptureError> {
-    let options = CaptureOptions {
+    let options = CaptureSettings {
         images: Some(images.to_path_buf()),
-        ..CaptureOptions::default()
+        ..CaptureSettings::default()
     };
     Capture::load(root, &options)
 }

@@ -136,7 +136,7 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use crate::CaptureOptions;
+    use crate::CaptureSettings;
     use crate::capture::test_capture::TestCapture;
 
     /// Nine photos by two cameras: what was written is what was read.
@@ -146,7 +146,7 @@ mod tests {
         let model = TestCapture::new();
         model.write_photos(from.path());
         model.write_binary(&from.path().join("sparse/0"));
-        let options = CaptureOptions::default();
+        let options = CaptureSettings::default();
         let mut capture = Capture::load(from.path(), &options).unwrap();
         capture.split.train = vec![0, 3, 4];
         capture.split.test = vec![1, 2, 5, 6, 7, 8];

@@ -18,7 +18,7 @@ fn good() -> (TempDir, TestCapture) {
 }
 
 fn load(root: &Path) -> Result<Capture, CaptureError> {
-    Capture::load(root, &CaptureOptions::default())
+    Capture::load(root, &CaptureSettings::default())
 }
 
 /// The error of loading `root`, which must be one line and name `file`.
@@ -221,9 +221,9 @@ fn downscale_averages_areas_and_divides_intrinsics() {
     let full = load(root.path()).unwrap();
     let half = Capture::load(
         root.path(),
-        &CaptureOptions {
+        &CaptureSettings {
             downscale: 2,
-            ..CaptureOptions::default()
+            ..CaptureSettings::default()
         },
     )
     .unwrap();
@@ -247,17 +247,17 @@ fn downscale_averages_areas_and_divides_intrinsics() {
     assert_eq!((w, h), (2, 1));
     assert_eq!(pixels, [8, 0, 255, 11, 0, 255]);
 
-    let none = CaptureOptions {
+    let none = CaptureSettings {
         downscale: 0,
-        ..CaptureOptions::default()
+        ..CaptureSettings::default()
     };
     assert!(matches!(
         Capture::load(root.path(), &none),
         Err(CaptureError::ZeroDownscale)
     ));
-    let much = CaptureOptions {
+    let much = CaptureSettings {
         downscale: 3,
-        ..CaptureOptions::default()
+        ..CaptureSettings::default()
     };
     let error = Capture::load(root.path(), &much).unwrap_err();
     assert!(matches!(error, CaptureError::PhotoTooSmall { .. }));

@@ -2,11 +2,13 @@
 //! their own do not cover: other types than f32, windows too long for a workgroup's memory.
 
 mod activation;
+#[cfg(feature = "cube")]
 mod photometric;
 #[cfg(feature = "cpu")]
 mod ssim;
 
 pub(crate) use activation::*;
+#[cfg(feature = "cube")]
 pub(crate) use photometric::*;
 #[cfg(feature = "cpu")]
 pub(crate) use ssim::*;

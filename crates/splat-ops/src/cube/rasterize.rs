@@ -8,9 +8,9 @@ use burn_cubecl::tensor::CubeTensor;
 use cubecl::client::Client;
 use splat_kernels::intersect::{Frames, IntersectError};
 use splat_kernels::rasterize::{
-    RasterizeInputs, RasterizeSettings, RasterizeState, count_evaluations, rasterize, rasterize_vjp,
+    RasterizeInputs, RasterizeSettings, RasterizeState, rasterize, rasterize_vjp,
 };
-use splat_kernels::{Buffer, MOST_BUFFERS, bindable_buffers};
+use splat_kernels::{MOST_BUFFERS, bindable_buffers};
 
 use super::{buffer, gradients, prepare, tensor};
 use crate::OpError;
@@ -153,7 +153,7 @@ pub(crate) fn work(
     let [cameras, gaussians, channels] = colors.dims();
     let upload = |data: burn::tensor::TensorData| {
         let values = data.convert::<f32>().try_into_vec::<f32>();
-        Buffer::from_f32(client, &values.unwrap_or_default())
+        splat_kernels::Buffer::from_f32(client, &values.unwrap_or_default())
     };
     let inputs = RasterizeInputs {
         packed: upload(projected.packed().into_data()),
@@ -172,7 +172,8 @@ pub(crate) fn work(
     };
     let settings = RasterizeSettings::from(settings);
     let (_, state) = rasterize(client, &inputs, &frames, &settings).map_err(op_error)?;
-    let count = count_evaluations(client, &inputs, &state, &frames, &settings);
+    let count =
+        splat_kernels::rasterize::count_evaluations(client, &inputs, &state, &frames, &settings);
     let count = count.map_err(|what| op_error(IntersectError::Device(what)))?;
     Ok(crate::RasterizeWork {
         intersections: state.lists.intersections as u64,

@@ -15,24 +15,23 @@ use super::checkpoint::RunRecord;
 use super::commands::{Command, Commands};
 use super::fingerprint::Fingerprint;
 use super::first::{default_max_gaussians, first_gaussians};
-use super::hooks::{Hook, Hooks};
 use super::loss_log::LossLog;
 use super::state::State;
 use super::trainer::Trainer;
+use super::watch::{Autosave, Watch};
 use super::{
-    Checkpoint, CheckpointError, History, IntoLoss, LossTerms, Progress, TrainConfig, TrainError,
+    Checkpoint, CheckpointError, History, IntoLoss, LossTerms, Progress, TrainError, TrainSettings,
     Warning, resolution_schedule, views,
 };
+use crate::hooks::{Hook, Hooks};
 
 type MakeModel<M> = dyn FnOnce(&SplatData, &Device) -> M + Send;
 type MakeOptimizer = dyn Fn(&Field) -> Option<FieldOptimizer> + Send;
-/// Puts a checkpoint where it outlives the process.
-type SaveCheckpoint = dyn FnMut(&Checkpoint) -> Result<(), CheckpointError> + Send;
 
 /// Builds a [`Trainer`].
 pub struct TrainerBuilder<M: SplatModel = Gaussians> {
     capture: Arc<Capture>,
-    config: TrainConfig,
+    config: TrainSettings,
     device: Device,
     model: Box<MakeModel<M>>,
     strategy: Option<Box<dyn Strategy<M>>>,
@@ -43,30 +42,12 @@ pub struct TrainerBuilder<M: SplatModel = Gaussians> {
     watch: Watch,
 }
 
-/// Who watches a run, and what is kept of it on the way.
-pub(super) struct Watch {
-    pub(super) interrupt: Arc<AtomicBool>,
-    pub(super) commands: Commands,
-    pub(super) evaluate_every: Option<usize>,
-    pub(super) autosave: Option<Autosave>,
-    pub(super) on_progress: Box<dyn FnMut(Progress) + Send>,
-    pub(super) on_warning: Box<dyn FnMut(&Warning) + Send>,
-}
-
-/// Keeps the state of a run from time to time.
-pub(super) struct Autosave {
-    pub(super) every: Duration,
-    pub(super) last: Instant,
-    pub(super) save: Box<SaveCheckpoint>,
-    /// Kinds of failure that were told.
-    pub(super) failures: Vec<String>,
-}
-
-impl TrainerBuilder {
-    pub(super) fn new(capture: Arc<Capture>) -> Self {
-        Self {
-            capture,
-            config: TrainConfig::default(),
+impl Trainer {
+    /// Begins to describe a run on these photos.
+    pub fn builder(capture: impl Into<Arc<Capture>>) -> TrainerBuilder {
+        TrainerBuilder {
+            capture: capture.into(),
+            config: TrainSettings::default(),
             device: Device::default(),
             model: Box::new(Gaussians::from_data),
             strategy: None,
@@ -74,17 +55,12 @@ impl TrainerBuilder {
             hooks: Hooks::default(),
             loss: None,
             resume: None,
-            watch: Watch {
-                interrupt: Arc::default(),
-                commands: Commands::new(None),
-                evaluate_every: None,
-                autosave: None,
-                on_progress: Box::new(|_| {}),
-                on_warning: Box::new(|_| {}),
-            },
+            watch: Watch::default(),
         }
     }
+}
 
+impl TrainerBuilder {
     /// Trains another model than [`Gaussians`], made of the first Gaussians on a device. To be
     /// called before [`strategy`](TrainerBuilder::strategy), whose type follows from it.
     pub fn model<M: SplatModel>(
@@ -108,8 +84,8 @@ impl TrainerBuilder {
 
 impl<M: SplatModel> TrainerBuilder<M> {
     /// Settings; the defaults are those of gsplat.
-    pub fn config(mut self, config: TrainConfig) -> Self {
-        self.config = config;
+    pub fn settings(mut self, settings: TrainSettings) -> Self {
+        self.config = settings;
         self
     }
 
@@ -285,7 +261,7 @@ impl<M: SplatModel> TrainerBuilder<M> {
 }
 
 /// Length, scene size and seed of the run.
-fn schedule(capture: &Capture, config: &TrainConfig) -> Result<RunSchedule, TrainError> {
+fn schedule(capture: &Capture, config: &TrainSettings) -> Result<RunSchedule, TrainError> {
     let cameras: Vec<_> = capture.views.iter().map(View::camera).collect();
     let points: Vec<[f64; 3]> = capture.points.iter().map(|point| point.position).collect();
     let scene_scale = SceneScale::of_capture(&cameras, &points);
@@ -305,7 +281,7 @@ fn schedule(capture: &Capture, config: &TrainConfig) -> Result<RunSchedule, Trai
 /// The model with an optimiser for each of its fields.
 fn optimized<M: SplatModel>(
     model: M,
-    config: &TrainConfig,
+    config: &TrainSettings,
     scene: SceneScale,
     optimizer: &MakeOptimizer,
 ) -> Result<Optimized<M>, TrainError> {

@@ -171,13 +171,13 @@ mod tests {
     use std::sync::Arc;
 
     use super::*;
-    use splat_data::{CaptureOptions, Split};
+    use splat_data::{CaptureSettings, Split};
 
     fn capture() -> Capture {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
-        let options = CaptureOptions {
+        let options = CaptureSettings {
             downscale: 16,
-            ..CaptureOptions::default()
+            ..CaptureSettings::default()
         };
         Capture::load(folder, &options).unwrap()
     }

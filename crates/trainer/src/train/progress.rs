@@ -7,9 +7,9 @@ use splat_data::{SceneSettings, SplatData};
 use splat_model::{Gaussians, RenderSettings, SplatModel};
 
 use super::checkpoint::RunRecord;
-use super::hooks::Hook;
 use super::state::State;
 use super::{Checkpoint, CheckpointError, History};
+use crate::hooks::Hook;
 
 /// Where a run stands, for whoever shows it.
 #[derive(Debug, Clone, Copy)]

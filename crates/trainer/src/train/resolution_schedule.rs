@@ -4,11 +4,11 @@ use std::collections::HashMap;
 
 use splat_model::strategy::StepInfo;
 
-use super::TrainConfig;
+use super::TrainSettings;
 use splat_data::{Capture, View};
 
 /// By what photos are divided at a step.
-pub(super) fn factor(config: &TrainConfig, at: &StepInfo) -> u32 {
+pub(super) fn factor(config: &TrainSettings, at: &StepInfo) -> u32 {
     let stages = at.step / at.run.milestone(config.coarse_every);
     let left = (config.coarse_halvings as usize).saturating_sub(stages);
     1 << left
@@ -45,15 +45,15 @@ mod tests {
     use splat_model::SceneScale;
     use splat_model::strategy::RunSchedule;
 
-    use splat_data::CaptureOptions;
+    use splat_data::CaptureSettings;
 
     #[test]
     fn resolution_doubles_at_every_milestone() {
         let factors = |steps: usize, at: [usize; 6]| {
-            let config = TrainConfig {
+            let config = TrainSettings {
                 steps,
                 coarse_halvings: 2,
-                ..TrainConfig::default()
+                ..TrainSettings::default()
             };
             let run = RunSchedule {
                 steps,
@@ -71,7 +71,7 @@ mod tests {
             seed: 0,
         };
         assert_eq!(
-            factor(&TrainConfig::default(), &StepInfo { step: 0, run }),
+            factor(&TrainSettings::default(), &StepInfo { step: 0, run }),
             1
         );
     }
@@ -79,9 +79,9 @@ mod tests {
     #[test]
     fn a_small_view_sees_the_same_and_is_made_once() {
         let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
-        let options = CaptureOptions {
+        let options = CaptureSettings {
             downscale: 4,
-            ..CaptureOptions::default()
+            ..CaptureSettings::default()
         };
         let capture = Capture::load(folder, &options).unwrap();
         let mut views = CoarseViews::default();

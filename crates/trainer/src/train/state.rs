@@ -8,7 +8,7 @@ use splat_model::{Optimized, SplatModel};
 use splat_ops::OpError;
 
 use super::History;
-use super::hooks::Hooks;
+use crate::hooks::Hooks;
 
 /// The model, its optimisers, the strategy and hooks, and how far the run got.
 pub(super) struct State<M: SplatModel> {

@@ -7,16 +7,16 @@ use std::sync::{Arc, Mutex};
 use std::time::Duration;
 
 use burn::tensor::Device;
-use splat_data::{Capture, CaptureOptions};
+use splat_data::{Capture, CaptureSettings};
 use splat_ops::OpError;
 
 use super::*;
 
 fn capture() -> Arc<Capture> {
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
-    let options = CaptureOptions {
+    let options = CaptureSettings {
         downscale: 8,
-        ..CaptureOptions::default()
+        ..CaptureSettings::default()
     };
     Arc::new(Capture::load(folder, &options).unwrap())
 }
@@ -26,24 +26,24 @@ fn builder() -> TrainerBuilder {
 }
 
 fn builder_on(capture: Arc<Capture>) -> TrainerBuilder {
-    let config = TrainConfig {
+    let config = TrainSettings {
         steps: 240,
-        ..TrainConfig::default()
+        ..TrainSettings::default()
     };
     Trainer::builder(capture)
-        .config(config)
+        .settings(config)
         .device(Device::flex())
 }
 
 /// Growth ends where a setting says, else where the photos do.
 #[test]
 fn the_photos_say_how_many_gaussians_are_worthwhile() {
-    let most = |capture: Capture, config: TrainConfig| {
-        let trainer = Trainer::builder(Arc::new(capture)).config(config);
+    let most = |capture: Capture, config: TrainSettings| {
+        let trainer = Trainer::builder(Arc::new(capture)).settings(config);
         let trainer = trainer.device(Device::flex()).build().unwrap();
         trainer.config.density.max_gaussians
     };
-    let config = TrainConfig::default();
+    let config = TrainSettings::default();
     let mut capture = Capture::clone(&capture());
     for view in &mut capture.views {
         (view.width, view.height) = (40, 30);
@@ -62,11 +62,11 @@ fn the_photos_say_how_many_gaussians_are_worthwhile() {
 fn a_resumed_run_goes_on_as_if_it_had_not_stopped() {
     // A quarter of the resolution for 60 steps, and half of it for another 60.
     let builder = || {
-        builder().config(TrainConfig {
+        builder().settings(TrainSettings {
             steps: 240,
             coarse_halvings: 2,
             coarse_every: 7_500,
-            ..TrainConfig::default()
+            ..TrainSettings::default()
         })
     };
     let whole = builder().build().unwrap().run().unwrap();
@@ -195,7 +195,7 @@ fn a_checkpoint_is_of_one_run() {
     let mut config = first.run.config.clone();
     config.learning_rates.sh0 *= 2.0;
     config.background = Some([1.0; 3]);
-    let error = refusal(&|builder| builder.config(config.clone())).unwrap();
+    let error = refusal(&|builder| builder.settings(config.clone())).unwrap();
     assert!(
         error.contains("background = absent") && error.contains("learning_rates.sh0"),
         "{error}"

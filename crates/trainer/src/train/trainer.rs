@@ -15,22 +15,40 @@ use splat_ops::device::keep_awake;
 use splat_ops::{OpError, Projected, SH_DEGREE_MAX};
 use tracing::trace_span;
 
-use super::builder::Watch;
 use super::checkpoint::RunRecord;
-use super::hooks::{HookView, Purpose};
 use super::loss_log::{LossLog, ReadLoss, UnreadLoss, check_finite};
 use super::state::State;
 use super::training_views::CaptureViews;
+use super::watch::Watch;
 use super::{
-    LossTerms, TargetView, TrainConfig, TrainError, TrainerBuilder, Warning, resolution_schedule,
-    views, warnings,
+    LossTerms, TargetView, TrainError, TrainSettings, Warning, resolution_schedule, views, warnings,
 };
+use crate::hooks::{HookView, Purpose};
 use crate::photo::pixels_u8;
 
 /// A training run.
+///
+/// ```
+/// use burn::tensor::Device;
+/// use splat_data::{Capture, CaptureSettings};
+/// use splat_trainer::{TrainSettings, Trainer, evaluate};
+///
+/// # let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
+/// let capture = Capture::load(folder, &CaptureSettings::new().with_downscale(16))?;
+/// let trained = Trainer::builder(capture.clone())
+///     .settings(TrainSettings::new().with_steps(3))
+///     .device(Device::flex())
+///     .build()?
+///     .run()?;
+/// let views: Vec<_> = capture.test_views().collect();
+/// let settings = &trained.render_settings;
+/// let scores = evaluate(&trained.model, &views, settings, &Device::flex(), |_, _| {})?;
+/// assert!(scores.psnr > 5.0 && trained.steps == 3);
+/// # Ok::<(), Box<dyn std::error::Error>>(())
+/// ```
 pub struct Trainer<M: SplatModel = Gaussians> {
     pub(super) capture: Arc<Capture>,
-    pub(super) config: TrainConfig,
+    pub(super) config: TrainSettings,
     pub(super) device: Device,
     pub(super) loss: LossTerms,
     pub(super) schedule: RunSchedule,
@@ -40,13 +58,6 @@ pub struct Trainer<M: SplatModel = Gaussians> {
     pub(super) record: RunRecord,
     pub(super) losses: LossLog,
     pub(super) coarse: resolution_schedule::CoarseViews,
-}
-
-impl Trainer {
-    /// Begins to describe a run on these photos.
-    pub fn builder(capture: impl Into<Arc<Capture>>) -> TrainerBuilder {
-        TrainerBuilder::new(capture.into())
-    }
 }
 
 /// A view of a step after its loss was measured.

@@ -20,7 +20,7 @@ use super::device_step::{self, write_device};
 use super::step::{StageColumn, at_degree, run, work_on, write_stages};
 use super::{DeviceMemory, Machine, PerformanceError, Spread, Work, all_threads, on_threads};
 use crate::memory::peak_rss_bytes;
-use splat_trainer::TrainConfig;
+use splat_trainer::TrainSettings;
 
 /// Numbers of Gaussians.
 pub const GAUSSIANS: [usize; 3] = [10_000, 100_000, 1_000_000];
@@ -88,7 +88,7 @@ pub fn measure_point(
     device: &Device,
 ) -> Result<Point, PerformanceError> {
     let capture = Arc::new(synthetic_capture(gaussians, size));
-    let config = at_degree(&TrainConfig::default(), 3);
+    let config = at_degree(&TrainSettings::default(), 3);
     if device_info(device).is_some() {
         let run = device_step::run(&capture, &config, device, WARM_UP, DEVICE_SECONDS)?;
         return Ok(Point {

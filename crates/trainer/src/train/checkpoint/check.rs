@@ -5,7 +5,7 @@
 use burn_pack::Scalar;
 
 use super::{History, Meta, SavedTensor};
-use crate::train::config::MOST_STEPS;
+use crate::train::settings::MOST_STEPS;
 
 /// More is no run but a damaged file: 300 years.
 const LONGEST_SECONDS: f64 = 1e10;

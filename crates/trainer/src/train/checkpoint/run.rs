@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::super::TrainConfig;
+use super::super::TrainSettings;
 use super::super::fingerprint::Fingerprint;
 use super::{Checkpoint, CheckpointError};
 
@@ -16,14 +16,14 @@ pub(in super::super) struct RunRecord {
     pub(in super::super) capture: Fingerprint,
     /// As TOML, which keeps every digit.
     #[serde(with = "as_toml")]
-    pub(in super::super) config: TrainConfig,
+    pub(in super::super) config: TrainSettings,
     /// What was changed when it was resumed, see [`Checkpoint::changes_with`].
     pub(in super::super) changes: Vec<String>,
 }
 
 impl Checkpoint {
     /// Settings of the run.
-    pub fn config(&self) -> &TrainConfig {
+    pub fn settings(&self) -> &TrainSettings {
         &self.meta.run.config
     }
 
@@ -34,17 +34,17 @@ impl Checkpoint {
     ///
     /// # Errors
     /// [`CheckpointError::OtherSettings`] and [`CheckpointError::NothingLeft`].
-    pub fn check_settings(&self, config: &TrainConfig) -> Result<(), CheckpointError> {
+    pub fn check_settings(&self, config: &TrainSettings) -> Result<(), CheckpointError> {
         let mut same = config.clone();
-        same.steps = self.config().steps;
-        same.density.max_gaussians = self.config().density.max_gaussians;
-        if let Some(difference) = self.config().difference_in_words(&same) {
+        same.steps = self.settings().steps;
+        same.density.max_gaussians = self.settings().density.max_gaussians;
+        if let Some(difference) = self.settings().difference_in_words(&same) {
             return Err(CheckpointError::OtherSettings {
                 path: self.path.clone(),
                 difference,
             });
         }
-        let (done, steps, wanted) = (self.step(), self.config().steps, config.steps);
+        let (done, steps, wanted) = (self.step(), self.settings().steps, config.steps);
         // A run whose steps are all done may still have its results to write.
         if wanted < done || (wanted == done && wanted != steps) {
             return Err(CheckpointError::NothingLeft {
@@ -59,9 +59,9 @@ impl Checkpoint {
 
     /// What going on with these settings changes about the run, and what was changed before, each
     /// in a line.
-    pub fn changes_with(&self, config: &TrainConfig) -> Vec<String> {
+    pub fn changes_with(&self, config: &TrainSettings) -> Vec<String> {
         let mut changes = self.meta.run.changes.clone();
-        for (name, was, is) in self.config().differences(config) {
+        for (name, was, is) in self.settings().differences(config) {
             if CHANGEABLE.contains(&name.as_str()) {
                 let step = self.step();
                 changes.push(format!(
@@ -106,14 +106,14 @@ impl Checkpoint {
     }
 }
 
-/// A [`TrainConfig`] as the text of a `config.toml`.
+/// A [`TrainSettings`] as the text of a `config.toml`.
 mod as_toml {
     use serde::{Deserialize, Deserializer, Serializer, de, ser};
 
-    use super::TrainConfig;
+    use super::TrainSettings;
 
     pub(super) fn serialize<S: Serializer>(
-        config: &TrainConfig,
+        config: &TrainSettings,
         serializer: S,
     ) -> Result<S::Ok, S::Error> {
         serializer.serialize_str(&toml::to_string(config).map_err(ser::Error::custom)?)
@@ -121,8 +121,8 @@ mod as_toml {
 
     pub(super) fn deserialize<'a, D: Deserializer<'a>>(
         deserializer: D,
-    ) -> Result<TrainConfig, D::Error> {
+    ) -> Result<TrainSettings, D::Error> {
         let text = String::deserialize(deserializer)?;
-        TrainConfig::parse(text.as_bytes()).map_err(de::Error::custom)
+        TrainSettings::parse(text.as_bytes()).map_err(de::Error::custom)
     }
 }

@@ -8,30 +8,30 @@ use burn::tensor::Device;
 use burn_pack::Scalar;
 
 use super::*;
-use crate::train::{TrainConfig, Trainer};
-use splat_data::{Capture, CaptureOptions};
+use crate::train::{TrainSettings, Trainer};
+use splat_data::{Capture, CaptureSettings};
 
 fn capture() -> Arc<Capture> {
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
-    let options = CaptureOptions {
+    let options = CaptureSettings {
         downscale: 8,
-        ..CaptureOptions::default()
+        ..CaptureSettings::default()
     };
     let mut capture = Capture::load(folder, &options).unwrap();
     capture.points.truncate(40);
     Arc::new(capture)
 }
 
-fn config(steps: usize) -> TrainConfig {
-    TrainConfig {
+fn config(steps: usize) -> TrainSettings {
+    TrainSettings {
         steps,
-        ..TrainConfig::default()
+        ..TrainSettings::default()
     }
 }
 
 /// The state after three steps.
 fn saved() -> Checkpoint {
-    let trainer = Trainer::builder(capture()).config(config(3));
+    let trainer = Trainer::builder(capture()).settings(config(3));
     let trained = trainer.device(Device::flex()).build().unwrap().run();
     trained.unwrap().checkpoint().unwrap()
 }
@@ -111,7 +111,7 @@ fn not_resumed(checkpoint: Checkpoint) -> String {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("checkpoint.safetensors");
     checkpoint.save(&path).unwrap();
-    let trainer = Trainer::builder(capture()).config(config(3));
+    let trainer = Trainer::builder(capture()).settings(config(3));
     let trainer = trainer.device(Device::flex());
     let trainer = trainer.resume(Checkpoint::load(&path).unwrap()).build();
     let message = trainer.map(drop).expect_err("it fits no run").to_string();
@@ -171,7 +171,7 @@ fn parts_that_do_not_fit_the_run_are_refused_when_it_goes_on() {
 fn a_checkpoint_of_another_loss_is_refused() {
     let loss =
         |_: &crate::TargetView, rendered: &splat_model::ops::Rendered| Ok(rendered.alpha().mean());
-    let trainer = Trainer::builder(capture()).config(config(9));
+    let trainer = Trainer::builder(capture()).settings(config(9));
     let trainer = trainer.device(Device::flex()).loss(loss).resume(saved());
     let message = trainer.build().map(drop).unwrap_err().to_string();
     assert!(message.contains("a loss of the terms"), "{message}");

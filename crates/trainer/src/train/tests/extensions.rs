@@ -15,6 +15,7 @@ use splat_model::{
 };
 
 use super::*;
+use crate::hooks::{Hook, HookView, Purpose};
 
 /// Gaussians with one number more each, which dims their colours.
 #[derive(Module, Debug)]
@@ -235,9 +236,9 @@ fn extended(steps: usize) -> TrainerBuilder<Dimmed> {
     let capture = capture();
     let views = capture.split.train.len();
     Trainer::builder(capture)
-        .config(TrainConfig {
+        .settings(TrainSettings {
             steps,
-            ..TrainConfig::default()
+            ..TrainSettings::default()
         })
         .device(Device::flex())
         .evaluate_every(4)
@@ -298,12 +299,12 @@ fn parts_from_outside_train_and_resume() {
 #[test]
 fn a_step_of_several_views_is_along_their_mean() {
     let run = |views: usize, steps: usize| {
-        let config = TrainConfig {
+        let config = TrainSettings {
             steps,
             views_per_step: views,
-            ..TrainConfig::default()
+            ..TrainSettings::default()
         };
-        builder().config(config).build().unwrap().run().unwrap()
+        builder().settings(config).build().unwrap().run().unwrap()
     };
     let (single, double) = (run(1, 1), run(2, 2));
     let first = f64::from(double.history.losses[0].total);
@@ -358,12 +359,12 @@ fn a_run_does_what_it_is_told() {
 
     // Nobody there to command is no command.
     let (_, queue) = command_queue();
-    let config = TrainConfig {
+    let config = TrainSettings {
         steps: 2,
-        ..TrainConfig::default()
+        ..TrainSettings::default()
     };
     let trained = builder()
-        .config(config)
+        .settings(config)
         .commands(queue)
         .build()
         .unwrap()

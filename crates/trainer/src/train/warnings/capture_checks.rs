@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use splat_data::SplatData;
 
 use super::{Warning, median, quantile};
-use crate::train::TrainConfig;
+use crate::train::TrainSettings;
 use splat_data::{Capture, View};
 
 /// Points that share a place are a warning from this share of all on: matches found twice are a few
@@ -44,7 +44,7 @@ const HIGH_RATE: f64 = 5.0;
 pub(in crate::train) fn inspect(
     capture: &Capture,
     splats: &SplatData,
-    config: &TrainConfig,
+    config: &TrainSettings,
 ) -> Vec<Warning> {
     let positions: Vec<DVec3> = capture
         .points
@@ -112,7 +112,7 @@ fn crowded(positions: &[DVec3], origin: DVec3, distance: f64) -> Option<Warning>
         .then_some(Warning::CompactPoints { radius, distance })
 }
 
-fn large(splats: &SplatData, config: &TrainConfig, distance: f64) -> Option<Warning> {
+fn large(splats: &SplatData, config: &TrainSettings, distance: f64) -> Option<Warning> {
     let log_scales = &splats.log_scales;
     let largest = |scales: &[f32; 3]| f64::from(scales.iter().copied().fold(f32::MIN, f32::max));
     let scale = median(log_scales.iter().map(largest)).exp();
@@ -202,7 +202,7 @@ fn is_noise(view: &View) -> bool {
     variance > 0.25 && covariance < NOISE * variance
 }
 
-fn high_rates(config: &TrainConfig) -> Option<Warning> {
+fn high_rates(config: &TrainSettings) -> Option<Warning> {
     let rates: Vec<(String, f64)> = config
         .learning_rates
         .factors()

@@ -30,7 +30,7 @@ pub struct HookView<'a> {
 }
 
 /// Something that is trained beside the model: poses, exposures, a background. Every method has a
-/// default that changes nothing. Given to [`TrainerBuilder::hook`](super::TrainerBuilder::hook);
+/// default that changes nothing. Given to [`TrainerBuilder::hook`](crate::TrainerBuilder::hook);
 /// asked in the order in which hooks were given.
 pub trait Hook: Any + Send {
     /// What a checkpoint calls it; no two hooks of a run share a name.
@@ -92,7 +92,7 @@ pub trait Hook: Any + Send {
 
 /// The hooks of a run.
 #[derive(Default)]
-pub(crate) struct Hooks(pub(super) Vec<Box<dyn Hook>>);
+pub(crate) struct Hooks(pub(crate) Vec<Box<dyn Hook>>);
 
 impl Hooks {
     pub(crate) fn cameras(
@@ -124,7 +124,7 @@ impl Hooks {
             .try_fold(rendered, |rendered, hook| hook.image(view, rendered))
     }
 
-    pub(super) fn step(&mut self, gradients: &mut Gradients, at: &StepInfo) -> Result<(), OpError> {
+    pub(crate) fn step(&mut self, gradients: &mut Gradients, at: &StepInfo) -> Result<(), OpError> {
         self.0
             .iter_mut()
             .try_for_each(|hook| hook.step(gradients, at))

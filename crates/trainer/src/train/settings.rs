@@ -25,7 +25,7 @@ pub(super) const MOST_STEPS: u64 = 1_000_000_000_000;
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Setters)]
 #[serde(default, deny_unknown_fields)]
 #[setters(prefix = "with_", strip_option)]
-pub struct TrainConfig {
+pub struct TrainSettings {
     /// Number of steps; milestones stated for 30,000 steps shrink with shorter runs. Default
     /// 30,000.
     pub steps: usize,
@@ -70,14 +70,14 @@ pub struct TrainConfig {
     pub density: AdcSettings,
 }
 
-impl TrainConfig {
+impl TrainSettings {
     /// The defaults; `with_*` methods change them one by one.
     pub fn new() -> Self {
         Self::default()
     }
 }
 
-impl Default for TrainConfig {
+impl Default for TrainSettings {
     fn default() -> Self {
         Self {
             steps: 30_000,
@@ -99,7 +99,7 @@ impl Default for TrainConfig {
     }
 }
 
-impl TrainConfig {
+impl TrainSettings {
     /// Reads a `config.toml`, a byte-order mark before it or not; or says in a line what is wrong
     /// with it. What it does not name is as by default.
     ///
@@ -312,10 +312,10 @@ mod tests {
 
     #[test]
     fn settings_are_read_with_and_without_a_byte_order_mark() {
-        let mut config = TrainConfig {
+        let mut config = TrainSettings {
             steps: 7,
             background: Some([0.0, 0.1, 1.0]),
-            ..TrainConfig::default()
+            ..TrainSettings::default()
         };
         config.learning_rates.means = 0.1 + 0.2;
         let text = toml::to_string(&config).unwrap();
@@ -324,7 +324,7 @@ mod tests {
             format!("\u{FEFF}{text}"),
             text.replace('\n', "\r\n"),
         ] {
-            assert_eq!(TrainConfig::parse(text.as_bytes()).as_ref(), Ok(&config));
+            assert_eq!(TrainSettings::parse(text.as_bytes()).as_ref(), Ok(&config));
         }
         let utf16: Vec<u8> = "\u{FEFF}seed = 1"
             .encode_utf16()
@@ -336,7 +336,7 @@ mod tests {
             (b"[package]\nname = \"other\"", "package"),
             (b"seed = -1", "seed"),
         ] {
-            let message = TrainConfig::parse(bytes).unwrap_err();
+            let message = TrainSettings::parse(bytes).unwrap_err();
             assert!(
                 message.contains(words) && !message.contains('\n'),
                 "{message}"
@@ -346,7 +346,7 @@ mod tests {
 
     #[test]
     fn what_differs_is_named() {
-        let here = TrainConfig::default();
+        let here = TrainSettings::default();
         let mut there = here.clone();
         assert_eq!(here.difference_in_words(&there), None);
         there.seed = 3;
@@ -364,8 +364,8 @@ mod tests {
 
     #[test]
     fn settings_that_would_spoil_a_run_are_named() {
-        let problem = |change: &dyn Fn(&mut TrainConfig)| {
-            let mut config = TrainConfig::default();
+        let problem = |change: &dyn Fn(&mut TrainSettings)| {
+            let mut config = TrainSettings::default();
             change(&mut config);
             config.validate().err().unwrap_or_default()
         };
