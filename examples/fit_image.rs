@@ -1,7 +1,6 @@
-//! Fits Gaussians to one picture with a loop of one's own: no capture, no trainer, no density control. To run it:
-//! `cargo run --release --example fit_image [PICTURE [STEPS]]`
+//! Fits Gaussians to one picture with a loop of one's own: no capture, no trainer, no density
+//! control. To run it: `cargo run --release --example fit_image [PICTURE [STEPS]]`
 
-use burn_splat::model::{FieldStep, LearningRates, Optimized};
 use burn_splat::ops::AdamRows;
 use burn_splat::prelude::*;
 use glam::DMat4;

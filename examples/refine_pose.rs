@@ -1,5 +1,5 @@
-//! Finds back a camera that was moved, by gradient descent through the renderer: the gradients of poses are those of any
-//! other input. To run it: `cargo run --release --example refine_pose`
+//! Finds back a camera that was moved, by gradient descent through the renderer: the gradients of
+//! poses are those of any other input. To run it: `cargo run --release --example refine_pose`
 
 use burn_splat::model::{InitSettings, splats_from_points};
 use burn_splat::prelude::*;
@@ -60,7 +60,8 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     Err("the camera was not found back".into())
 }
 
-/// A step of constant length along the gradient of the pose: a turn and a shift in the camera's frame.
+/// A step of constant length along the gradient of the pose: a turn and a shift in the camera's
+/// frame.
 fn descended(viewmat: DMat4, gradient: &[f32], size: f64, step: usize) -> DMat4 {
     let entry = |row: usize, column: usize| f64::from(gradient[row * 4 + column]);
     // dL/d(turn) of exp([turn]) V: the antisymmetric part of G V^T.

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use super::Failure;
 use splat_data::text::utf8;
-use splat_trainer::train::TrainSettings;
+use splat_trainer::TrainSettings;
 
 /// Reads a file and what `parse` makes of its text, without a byte-order mark; errors name the
 /// file.

@@ -17,7 +17,7 @@ use crate::report::progress::Progress;
 use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
 use resume::Interrupted;
 use splat_data::{Capture, CaptureSettings};
-use splat_trainer::train::{Checkpoint, TrainSettings, Trainer, TrainerBuilder};
+use splat_trainer::{Checkpoint, TrainSettings, Trainer, TrainerBuilder};
 
 /// The held-out views are measured this many times during a run, for the curves.
 const MEASUREMENTS: usize = 10;

@@ -60,6 +60,11 @@ impl Gaussians {
         };
         let data = self.to_data();
         let n = data.len();
+        if let Some(field) = with_nan(&data) {
+            return Err(failed(format!(
+                "`{field}` of the model has a NaN, which no reader would take"
+            )));
+        }
         let mut tensors = vec![
             tensor("means", vec![n, 3], data.means.as_flattened()),
             tensor("log_scales", vec![n, 3], data.log_scales.as_flattened()),
@@ -97,6 +102,22 @@ impl Gaussians {
         let data = parse(bytes).map_err(failed)?;
         Ok(Self::from_data(&data, device))
     }
+}
+
+/// The first field with a value that is no number.
+fn with_nan(data: &SplatData) -> Option<&'static str> {
+    let fields: [(&'static str, &[f32]); 6] = [
+        ("means", data.means.as_flattened()),
+        ("log_scales", data.log_scales.as_flattened()),
+        ("quats", data.quats.as_flattened()),
+        ("opacity_logits", &data.opacity_logits),
+        ("sh0", data.sh0.as_flattened()),
+        ("sh_rest", &data.sh_rest),
+    ];
+    let bad = fields
+        .iter()
+        .find(|(_, values)| values.iter().any(|value| value.is_nan()));
+    bad.map(|(name, _)| *name)
 }
 
 fn tensor(name: &str, shape: Vec<usize>, values: &[f32]) -> Tensor {
@@ -217,7 +238,7 @@ impl Fields {
             .ok_or_else(|| format!("`{name}` is missing"))?;
         let rows = shape.first().copied().unwrap_or(0);
         let own_width: usize = shape.iter().skip(1).product();
-        if own_width != width || n.is_some_and(|n| n != rows) {
+        if shape.is_empty() || own_width != width || n.is_some_and(|n| n != rows) {
             let expected = n.map_or_else(|| "N".to_owned(), |n| n.to_string());
             return Err(format!(
                 "`{name}` has shape {shape:?} instead of {expected} rows of {width}"
@@ -309,6 +330,9 @@ mod tests {
             tensors[0] = tensor("means", vec![1, 3], &[0.0, f32::NAN, 0.0])
         };
         assert!(with(&nan).contains("`means`: value 1"));
+        let scalar =
+            |tensors: &mut Vec<Tensor>| tensors[3] = tensor("opacity_logits", vec![], &[0.0]);
+        assert!(with(&scalar).contains("`opacity_logits` has shape []"));
         let more = |tensors: &mut Vec<Tensor>| tensors.push(tensor("heat", vec![1], &[0.0]));
         assert!(with(&more).contains("`heat`"));
     }

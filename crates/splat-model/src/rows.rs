@@ -119,7 +119,8 @@ impl RowEdit {
         self.change(row, field, ChangeKind::Offset, values);
     }
 
-    /// Replaces the values that a new row has in a field: as many as the field is wide.
+    /// Replaces the values that a new row has in a field, as many as the field is wide; what is
+    /// offset beside is then without effect.
     pub fn set(&mut self, row: usize, field: &str, values: &[f32]) {
         self.change(row, field, ChangeKind::Set, values);
     }
@@ -197,7 +198,16 @@ impl RowEdit {
             .collect();
     }
 
-    /// The changes of all fields that have any.
+    /// Row, field and number of values of every change.
+    pub(crate) fn widths(&self) -> impl Iterator<Item = (usize, &str, usize)> {
+        let rows = self.rows.iter().enumerate();
+        rows.flat_map(|(row, new)| {
+            let changes = new.changes.iter();
+            changes.map(move |change| (row, change.field.as_str(), change.values.len()))
+        })
+    }
+
+    /// The changes of all fields that have any, of widths that fit.
     pub(crate) fn changes(&self) -> BTreeMap<&str, FieldChanges> {
         let mut fields: BTreeMap<&str, FieldChanges> = BTreeMap::new();
         for (index, row) in self.rows.iter().enumerate() {

@@ -175,8 +175,13 @@ pub fn photometric_masked(
         "[B, H, W, D]",
     )?;
     let kept = mask.clone().sum();
-    let masked = rendered.clone() * mask.clone().repeat_dim(3, rendered.dims()[3]);
+    // Chosen, not multiplied by zero, which would let a NaN through.
+    let left_out = mask.clone().equal_elem(0.0);
+    let channels_rendered = rendered.dims()[3];
+    let masked = rendered * mask.clone().repeat_dim(3, channels_rendered);
+    let masked = masked.mask_fill(left_out.clone().repeat_dim(3, channels_rendered), 0.0);
     let values = values * mask.repeat_dim(3, channels);
+    let values = values.mask_fill(left_out.repeat_dim(3, channels), 0.0);
     let losses = photometric(masked, values, args)?.losses();
     // Of a mean over all pixels that over the pixels kept.
     let share = kept.clamp_min(1.0).recip() * (b * h * w) as f64;

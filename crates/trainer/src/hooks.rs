@@ -44,8 +44,8 @@ pub trait Hook: Any + Send {
         Ok(cameras)
     }
 
-    /// The colour behind the scene, `[C, 3]`, if it is this hook's to say; the first that has one
-    /// says it.
+    /// The colour behind the scene, `[C, 3]`, if this hook has one; the first hook that returns one
+    /// wins.
     ///
     /// # Errors
     /// As those of the ops that it uses.

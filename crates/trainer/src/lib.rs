@@ -3,12 +3,15 @@
 mod evaluate;
 mod hooks;
 mod photo;
-pub mod train;
+mod train;
 
 pub use evaluate::{Scores, ViewScore, evaluate};
 pub use hooks::{Hook, HookView, Purpose};
 pub use photo::photo;
+#[doc(hidden)]
+pub use train::expected_checksum;
 pub use train::{
-    Checkpoint, CheckpointError, Command, History, LossTerms, Progress, Snapshot, TargetView,
-    TrainError, TrainSettings, Trained, Trainer, TrainerBuilder, Warning, command_queue,
+    Checkpoint, CheckpointError, Command, History, IntoLoss, LOSS_BATCH, LossRecord, LossTerms,
+    Progress, Snapshot, TargetView, TrainError, TrainSettings, Trained, Trainer, TrainerBuilder,
+    Warning, command_queue,
 };

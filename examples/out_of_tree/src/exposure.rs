@@ -1,11 +1,6 @@
 //! A gain for each training view, trained beside the model by an optimiser of its own.
 
-use burn_splat::burn::tensor::Gradients;
-use burn_splat::model::optimizer::{SplatAdam, StateRecord};
-use burn_splat::model::strategy::StepInfo;
-use burn_splat::model::{FieldStep, Optimized};
 use burn_splat::prelude::*;
-use burn_splat::train::{Hook, HookView};
 
 #[derive(Module, Debug)]
 struct Gains {

@@ -1,6 +1,5 @@
 //! Gaussians with a trained tint each, which multiplies their colours.
 
-use burn_splat::model::{Field, LearningRates, SplatModel};
 use burn_splat::prelude::*;
 
 #[derive(Module, Debug)]

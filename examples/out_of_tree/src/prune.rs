@@ -1,8 +1,6 @@
-//! A strategy: every 25 steps the faintest Gaussians go, and those with the largest gradients are
-//! cloned.
+//! A strategy without state in checkpoints: every 25 steps the faintest Gaussians go, and those
+//! with the largest gradients are cloned.
 
-use burn_splat::model::strategy::{Refinement, ScreenWants, StepContext, StepInfo, Strategy};
-use burn_splat::model::{Moments, RowEdit, SplatModel};
 use burn_splat::ops::ScreenStatistics;
 use burn_splat::ops::device::to_host;
 use burn_splat::prelude::*;
@@ -53,7 +51,9 @@ impl<M: SplatModel> Strategy<M> for PruneAndClone {
         let sources = edit.sources();
         edit.retain(|row| logits[sources[row] as usize] > FAINT);
         let pruned = sources.len() - edit.len();
-        context.model.edit_rows(&edit)?;
+        if !edit.is_empty() {
+            context.model.edit_rows(&edit)?;
+        }
         Ok(Some(Refinement {
             cloned: order.len(),
             pruned,

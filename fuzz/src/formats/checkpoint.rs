@@ -9,8 +9,8 @@ use burn::tensor::Device;
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
 use serde_json::{Value, json};
-use splat_trainer::train::Checkpoint;
-use splat_trainer::train::expected_checksum;
+use splat_trainer::Checkpoint;
+use splat_trainer::expected_checksum;
 use splat_trainer::{TrainSettings, Trainer};
 
 use super::{

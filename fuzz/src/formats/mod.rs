@@ -14,7 +14,7 @@ use std::sync::{Arc, LazyLock};
 use burn::tensor::Device;
 use rand_pcg::Pcg64Mcg;
 use splat_data::Capture;
-use splat_trainer::train::Checkpoint;
+use splat_trainer::Checkpoint;
 use splat_trainer::{TrainSettings, Trainer};
 
 /// What is run: the content of one file, or of several that belong together.

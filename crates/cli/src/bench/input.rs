@@ -8,7 +8,7 @@ use clap::Args;
 use super::{Failure, GlobalArgs};
 use crate::photos::PhotoArgs;
 use splat_data::Capture;
-use splat_trainer::train::TrainSettings;
+use splat_trainer::TrainSettings;
 
 /// The capture that the project carries.
 pub(super) const EXAMPLE: &str = "examples/data/saharov";

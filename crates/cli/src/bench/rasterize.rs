@@ -12,7 +12,7 @@ use crate::report::probe_files;
 use crate::scene;
 use splat_data::View;
 use splat_lab::performance::rasterize::{RasterizeReport, measure};
-use splat_trainer::train::Trainer;
+use splat_trainer::Trainer;
 
 /// The rasteriser: evaluations per second, on the CPU per core, on the lists of a real scene
 #[derive(Debug, Args)]

@@ -4,7 +4,7 @@ use std::fmt::Write;
 use std::path::Path;
 
 use super::{ReportError, write};
-use splat_trainer::train::History;
+use splat_trainer::History;
 
 /// Writes one row per step: `step`, `loss` (the weighted sum), then each term without its weight.
 ///
@@ -45,7 +45,7 @@ fn quoted(name: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use splat_trainer::train::LossRecord;
+    use splat_trainer::LossRecord;
 
     #[test]
     fn a_row_per_step_under_the_names_of_the_terms() {

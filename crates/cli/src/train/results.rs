@@ -21,7 +21,7 @@ use crate::report::view_names::ViewNames;
 use crate::report::{ReportError, probe_file, probe_folder, refuse_inputs, write_durably};
 use splat_data::{Capture, View, WriteError};
 use splat_lab::memory::peak_rss_bytes;
-use splat_trainer::train::{CheckpointError, History, TrainSettings, Trained};
+use splat_trainer::{CheckpointError, History, TrainSettings, Trained};
 use splat_trainer::{Scores, evaluate};
 
 /// The scene's file.

@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use super::super::Failure;
 use super::results::{CHECKPOINT, METRICS, SCENE};
-use splat_trainer::train::Checkpoint;
+use splat_trainer::Checkpoint;
 
 /// An interrupted run.
 pub(super) struct Interrupted {

@@ -46,13 +46,28 @@ pub fn read(path: impl AsRef<Path>) -> Result<SplatData, SceneFileError> {
     (format.read)(path)
 }
 
-/// Writes a scene in the format of the file's name; PLY where it says none.
+/// Writes a scene in the format of the file's name; PLY where the name has no ending.
 ///
 /// # Errors
-/// When the scene cannot be written, see [`SceneFileError`].
+/// When no format has files of that name, or the scene cannot be written, see [`SceneFileError`].
 pub fn write(path: impl AsRef<Path>, scene: &SplatData) -> Result<(), SceneFileError> {
     let path = path.as_ref();
-    (of_name(path).unwrap_or(&FORMATS[0]).write)(path, scene)
+    let format = match (of_name(path), path.extension()) {
+        (Some(format), _) => format,
+        (None, None) => &FORMATS[0],
+        (None, Some(_)) => {
+            let endings = FORMATS.iter().flat_map(|format| format.endings);
+            let endings: Vec<String> = endings.map(|ending| format!(".{ending}")).collect();
+            return Err(SceneFileError::Header {
+                path: path.to_path_buf(),
+                reason: format!(
+                    "no format of that name is known; name it {}",
+                    endings.join(", ")
+                ),
+            });
+        }
+    };
+    (format.write)(path, scene)
 }
 
 fn of_name(path: &Path) -> Option<&'static SceneFormat> {
@@ -82,6 +97,12 @@ mod tests {
             write(&path, &scene).unwrap();
             assert_eq!(read(&path).unwrap(), scene, "{name}");
         }
+        let other = write(folder.path().join("scene.splat"), &scene);
+        let other = other.unwrap_err().to_string();
+        assert!(
+            other.contains("scene.splat") && other.contains(".ply"),
+            "{other}"
+        );
         let missing = read(folder.path().join("none.ply"))
             .unwrap_err()
             .to_string();

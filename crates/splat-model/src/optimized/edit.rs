@@ -1,12 +1,12 @@
 //! Edits of rows, of the values and the moments alike.
 
 use burn::module::Module;
-use burn::tensor::{Int, Tensor, TensorData};
+use burn::tensor::{Bool, Int, Tensor, TensorData};
 use splat_ops::OpError;
 
 use super::Optimized;
 use super::fields::change;
-use crate::field::Field;
+use crate::field::{Field, GAUSSIANS};
 use crate::optimizer::MomentEdit;
 use crate::rows::{FieldChanges, Moments, RowEdit};
 
@@ -15,9 +15,11 @@ impl<M: Module> Optimized<M> {
     /// the device. Parameters keep their ids.
     ///
     /// # Errors
-    /// When the edit names an old row or a field that there is not, or values of another width.
+    /// When the edit names an old row, a row set or a field that there is not, has values of
+    /// another width, or leaves no Gaussian. Nothing is changed then.
     pub fn edit_rows(&mut self, edit: &RowEdit) -> Result<(), OpError> {
         self.check_edit(edit)?;
+        self.edits += 1;
         let device = match self
             .fields
             .iter()
@@ -31,13 +33,11 @@ impl<M: Module> Optimized<M> {
         };
         let n = edit.len();
         let sources: Vec<i32> = edit.sources().iter().map(|row| *row as i32).collect();
-        let keep: Vec<f32> = edit
-            .moments()
-            .iter()
-            .map(|moments| f32::from(u8::from(*moments == Moments::Keep)))
+        let restarts: Vec<bool> = (edit.moments().iter())
+            .map(|moments| *moments == Moments::Restart)
             .collect();
         let source = Tensor::<1, Int>::from_data(TensorData::new(sources, [n]), &device);
-        let keep = Tensor::<1>::from_data(TensorData::new(keep, [n]), &device);
+        let restarts = Tensor::<1, Bool>::from_data(TensorData::new(restarts, [n]), &device);
         let mut changes = edit.changes();
         let edited: Vec<String> = self
             .fields
@@ -56,7 +56,7 @@ impl<M: Module> Optimized<M> {
                 None => value,
             }
         });
-        let moments = MomentEdit::Gather { source, keep };
+        let moments = MomentEdit::Gather { source, restarts };
         for field in &edited {
             if let Some(optimizer) = self.optimizers.get_mut(field) {
                 optimizer.edit_rows(&moments);
@@ -78,6 +78,12 @@ impl<M: Module> Optimized<M> {
         };
         let shapes = self.shapes();
         let in_set = |field: &&Field| field.row_set == Some(edit.row_set());
+        if !self.fields.iter().any(|field| in_set(&field)) {
+            return wrong(format!("the model has no row set {}", edit.row_set()));
+        }
+        if edit.row_set() == GAUSSIANS && edit.is_empty() {
+            return wrong("no Gaussian would be left, and nothing could grow back".to_owned());
+        }
         for field in self.fields.iter().filter(in_set) {
             let [rows, _] = shapes[&field.name];
             let beyond = |source: &u32| *source as usize >= rows;
@@ -89,25 +95,18 @@ impl<M: Module> Optimized<M> {
                 ));
             }
         }
-        for (name, changes) in edit.changes() {
-            let known = self
-                .fields
-                .iter()
-                .filter(in_set)
-                .any(|field| field.name == name);
+        for (row, name, width) in edit.widths() {
+            let known = (self.fields.iter().filter(in_set)).any(|field| field.name == name);
             if !known {
                 return wrong(format!(
                     "it changes `{name}`, which is no field of the row set"
                 ));
             }
-            let [_, width] = shapes[name];
-            let fits = changes
-                .offsets
-                .as_ref()
-                .is_none_or(|all| all.len() == width * edit.len())
-                && changes.set_values.len() == width * changes.set_rows.len();
-            if !fits {
-                return wrong(format!("values for `{name}` must be {width} a row"));
+            let [_, expected] = shapes[name];
+            if width != expected {
+                return wrong(format!(
+                    "new row {row} changes {width} values of `{name}`, which has {expected} a row"
+                ));
             }
         }
         Ok(())

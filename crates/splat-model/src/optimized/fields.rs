@@ -64,6 +64,28 @@ impl<V: VisitField> ModuleVisitor for FieldVisitor<V> {
     }
 }
 
+impl<V> FieldVisitor<V> {
+    pub(super) fn new(names: HashMap<String, String>, visit: V) -> Self {
+        Self {
+            names,
+            path: Vec::new(),
+            visit,
+        }
+    }
+}
+
+/// The first field that autodiff does not track.
+#[derive(Default)]
+pub(super) struct Untracked(pub(super) Option<String>);
+
+impl VisitField for &mut Untracked {
+    fn visit<const D: usize>(&mut self, name: &str, param: &Param<Tensor<D>>) {
+        if !param.is_require_grad() {
+            self.0.get_or_insert_with(|| name.to_owned());
+        }
+    }
+}
+
 pub(super) struct ValuesOf<F>(pub(super) F);
 
 impl<F: FnMut(&str, Tensor<2>)> VisitField for ValuesOf<F> {

@@ -16,7 +16,7 @@ use splat_ops::{AdamRows, OpError};
 use crate::field::Field;
 use crate::optimizer::{FieldOptimizer, MomentEdit, SplatAdam};
 use crate::{LearningRates, SplatModel};
-use fields::{FieldVisitor, GradientsOf, Paths, ValuesOf, change};
+use fields::{FieldVisitor, GradientsOf, Paths, Untracked, ValuesOf, change};
 
 /// Gradients by the name of the field, each `[N, width]`: what is beyond the first dimension is
 /// flattened.
@@ -27,9 +27,9 @@ pub type FieldGradients = BTreeMap<String, Tensor<2>>;
 pub enum FieldStep {
     /// A step, with the field's rate times this factor.
     Step(f64),
-    /// None; the gradient is added to that of the next step.
+    /// No step; the gradient is added to that of the next one.
     Accumulate,
-    /// None; the gradient is forgotten.
+    /// No step; the gradient is discarded, and so is what was accumulated.
     Skip,
 }
 
@@ -44,6 +44,8 @@ pub struct Optimized<M> {
     optimizers: BTreeMap<String, FieldOptimizer>,
     /// Gradients that wait for a step.
     waiting: FieldGradients,
+    /// Edits of rows so far.
+    edits: usize,
 }
 
 impl<M: Module> Optimized<M> {
@@ -64,6 +66,7 @@ impl<M: Module> Optimized<M> {
             fields,
             optimizers,
             waiting: FieldGradients::new(),
+            edits: 0,
         };
         trained.check_fields()?;
         Ok(trained)
@@ -122,6 +125,18 @@ impl<M: Module> Optimized<M> {
         if self.optimizers.len() != self.fields.len() {
             return wrong("two fields have one name; give each its own".to_owned());
         }
+        let names = self.names();
+        if names.len() != self.fields.len() {
+            return wrong("two fields have one path; a parameter is one field".to_owned());
+        }
+        let mut untracked = Untracked::default();
+        self.model()
+            .visit(&mut FieldVisitor::new(names, &mut untracked));
+        if let Some(name) = untracked.0 {
+            return wrong(format!(
+                "autodiff does not track `{name}`; make the module on `device.autodiff()`, and declare no field for what is frozen"
+            ));
+        }
         if let Some(field) = self.fields.iter().find(|field| field.name.contains('.')) {
             return wrong(format!(
                 "the name `{}` has a dot, which separates names in checkpoints",
@@ -158,6 +173,11 @@ impl<M: Module> Optimized<M> {
         self.model.as_ref().expect(WHOLE)
     }
 
+    /// How often rows were edited: gradients of before an edit belong to other rows.
+    pub fn edits(&self) -> usize {
+        self.edits
+    }
+
     /// The model without its moments.
     pub fn into_model(self) -> M {
         self.model.expect(WHOLE)
@@ -184,7 +204,7 @@ impl<M: Module> Optimized<M> {
     /// # Errors
     /// When the model has no such field, or the device fails.
     pub fn read<const K: usize>(&self, names: [&str; K]) -> Result<[Vec<f32>; K], OpError> {
-        let mut values = BTreeMap::new();
+        let mut values: BTreeMap<String, Tensor<2>> = BTreeMap::new();
         self.visit(|field, value| {
             if names.contains(&field) {
                 values.insert(field.to_owned(), value);
@@ -196,7 +216,7 @@ impl<M: Module> Optimized<M> {
         };
         let tensors: Vec<Tensor<2>> = names
             .iter()
-            .map(|name| values.remove(*name).ok_or_else(|| missing(name)))
+            .map(|name| values.get(*name).cloned().ok_or_else(|| missing(name)))
             .collect::<Result<_, _>>()?;
         let read = tensors
             .into_iter()
@@ -216,14 +236,13 @@ impl<M: Module> Optimized<M> {
     /// Takes the gradients of the fields out of those of a backward pass.
     pub fn gradients(&self, gradients: &mut Gradients) -> FieldGradients {
         let mut taken = FieldGradients::new();
-        let mut visitor = FieldVisitor {
-            names: self.names(),
-            path: Vec::new(),
-            visit: GradientsOf {
+        let mut visitor = FieldVisitor::new(
+            self.names(),
+            GradientsOf {
                 gradients,
                 taken: &mut taken,
             },
-        };
+        );
         self.model().visit(&mut visitor);
         taken
     }
@@ -278,9 +297,12 @@ impl<M: Module> Optimized<M> {
             Some((name, tensor)) => Err(OpError::Argument {
                 op,
                 what: format!(
-                    "`{name}` has shape {:?}, the field of that name {:?}",
+                    "`{name}` has shape {:?}, {}",
                     tensor.dims(),
-                    shapes.get(name)
+                    match shapes.get(name) {
+                        Some(shape) => format!("the field of that name {shape:?}"),
+                        None => "and is no field".to_owned(),
+                    }
                 ),
             }),
         }
@@ -337,6 +359,20 @@ impl<M: Module> Optimized<M> {
         shapes
     }
 
+    /// Names of the float parameters that are no fields, by path.
+    fn other_names(&self) -> HashMap<String, String> {
+        let mut paths = Paths::default();
+        self.model().visit(&mut paths);
+        let fields = self.names();
+        let others = (paths.found.into_iter()).filter(|path| !fields.contains_key(path));
+        others
+            .map(|path| {
+                let name = format!("{FIXED}/{}", path.replace('.', "/"));
+                (path, name)
+            })
+            .collect()
+    }
+
     fn names(&self) -> HashMap<String, String> {
         let names = self.fields.iter();
         names
@@ -345,13 +381,11 @@ impl<M: Module> Optimized<M> {
     }
 
     fn visit(&self, visit: impl FnMut(&str, Tensor<2>)) {
-        let mut visitor = FieldVisitor {
-            names: self.names(),
-            path: Vec::new(),
-            visit: ValuesOf(visit),
-        };
+        let mut visitor = FieldVisitor::new(self.names(), ValuesOf(visit));
         self.model().visit(&mut visitor);
     }
 }
 
+/// Under this name parameters that are no fields are saved.
+const FIXED: &str = "fixed";
 const WHOLE: &str = "the model is put back after every change";

@@ -7,7 +7,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use splat_ops::OpError;
 
 use super::Optimized;
-use super::fields::change;
+use super::fields::{FieldVisitor, ValuesOf, change};
 use crate::optimizer::StateRecord;
 
 /// Name of a gradient that waits for a step, beside the moments.
@@ -15,12 +15,21 @@ const WAITING: &str = "waiting_gradient";
 
 impl<M: Module> Optimized<M> {
     /// Values and optimiser states of all fields, on the host: value `means` is tensor `means`, a
-    /// moment of it `means.moment_1`. Values are `[N, width]`.
+    /// moment of it `means.moment_1`. Values are `[N, width]`. Parameters that are no fields are
+    /// kept too, under `fixed/`.
     ///
     /// # Errors
     /// When the device fails.
     pub fn save(&self) -> Result<StateRecord, OpError> {
         let mut record = StateRecord::default();
+        let mut fixed = Vec::new();
+        self.model().visit(&mut FieldVisitor::new(
+            self.other_names(),
+            ValuesOf(|name: &str, value: Tensor<2>| fixed.push((name.to_owned(), value))),
+        ));
+        for (name, value) in fixed {
+            record.tensors.insert(name, value.into_data());
+        }
         for field in &self.fields {
             let name = &field.name;
             let [values] = self.read([name.as_str()])?;
@@ -54,13 +63,15 @@ impl<M: Module> Optimized<M> {
     /// ids.
     ///
     /// # Errors
-    /// What does not fit the model or its optimisers, naming the field; nothing is changed then but
-    /// the state of optimisers.
+    /// What does not fit the model or its optimisers, naming the field. The model is as it was
+    /// then; optimisers may have been restored.
     pub fn restore(&mut self, record: StateRecord, device: &Device) -> Result<(), String> {
         let mut fields = record.by_field();
         let shapes = self.shapes();
         let mut values = BTreeMap::new();
         let mut rows_of_set = BTreeMap::new();
+        let mut waiting_gradients = BTreeMap::new();
+        let mut fixed = self.restore_fixed(&mut fields, device)?;
         for field in &self.fields {
             let name = &field.name;
             let (value, mut state) = match fields.remove(name) {
@@ -90,8 +101,7 @@ impl<M: Module> Optimized<M> {
                         waiting.shape().to_vec()
                     ));
                 }
-                self.waiting
-                    .insert(name.clone(), Tensor::from_data(waiting, device));
+                waiting_gradients.insert(name.clone(), Tensor::from_data(waiting, device));
             }
             if let Some(optimizer) = self.optimizers.get_mut(name) {
                 let restored = optimizer.restore(state, [rows, width], device);
@@ -102,10 +112,45 @@ impl<M: Module> Optimized<M> {
         if let Some(name) = fields.keys().next() {
             return Err(format!("`{name}` is no field of the model"));
         }
+        self.waiting = waiting_gradients;
         let names = self.names();
         change(&mut self.model, names, |name, value| {
             values.remove(name).unwrap_or(value)
         });
+        let names = self.other_names();
+        change(&mut self.model, names, |name, value| {
+            fixed.remove(name).unwrap_or(value)
+        });
         Ok(())
+    }
+
+    /// The parameters that are no fields, taken out of a record: all of them, and of the model's
+    /// shapes.
+    fn restore_fixed(
+        &self,
+        fields: &mut BTreeMap<String, (Option<TensorData>, StateRecord)>,
+        device: &Device,
+    ) -> Result<BTreeMap<String, Tensor<2>>, String> {
+        let mut own = Vec::new();
+        self.model().visit(&mut FieldVisitor::new(
+            self.other_names(),
+            ValuesOf(|name: &str, value: Tensor<2>| own.push((name.to_owned(), value.dims()))),
+        ));
+        let mut fixed = BTreeMap::new();
+        for (name, shape) in own {
+            match fields.remove(&name) {
+                Some((Some(data), _)) if data.shape()[..] == shape => {
+                    fixed.insert(name, Tensor::from_data(data, device));
+                }
+                Some((Some(data), _)) => {
+                    let found = data.shape().to_vec();
+                    return Err(format!(
+                        "`{name}` has shape {found:?}, the model's has {shape:?}"
+                    ));
+                }
+                _ => return Err(format!("`{name}` is missing")),
+            }
+        }
+        Ok(fixed)
     }
 }

@@ -122,7 +122,7 @@ fn edits_that_do_not_fit_are_refused_before_anything_changes() {
     assert!(refused(&mut optimized, &edit).contains("`detail`"));
     let mut edit = RowEdit::identity(3);
     edit.set(1, "means", &[0.0; 3]);
-    assert!(refused(&mut optimized, &edit).contains("2 a row"));
+    assert!(refused(&mut optimized, &edit).contains("3 values of `means`, which has 2 a row"));
     assert!(
         optimized
             .read(["heat", "cold"])
@@ -134,7 +134,7 @@ fn edits_that_do_not_fit_are_refused_before_anything_changes() {
 
 #[test]
 fn fields_that_the_model_does_not_have_are_named() {
-    let device = Device::flex();
+    let device = Device::flex().autodiff();
     let refused = |change: &dyn Fn(&mut Vec<Field>)| {
         let mut fields = fields();
         change(&mut fields);
@@ -249,4 +249,73 @@ fn values_and_gradients_of_another_shape_are_refused() {
     assert!(message.to_string().contains("no field `cold`"));
     optimized.update("gain", |value| value * 2.0).unwrap();
     assert_eq!(values(&optimized.model().gain), [0.0, 2.0, 4.0, 6.0]);
+}
+
+/// Every change is as wide as its field, and not only all of them together.
+#[test]
+fn changes_of_another_width_are_named_by_row() {
+    let device = Device::flex().autodiff();
+    let mut optimized = optimized(&device);
+    let refused = |optimized: &mut Optimized<Model>, change: &dyn Fn(&mut RowEdit)| {
+        let mut edit = RowEdit::identity(3);
+        change(&mut edit);
+        optimized.edit_rows(&edit).unwrap_err().to_string()
+    };
+    let offsets = |edit: &mut RowEdit| {
+        edit.offset(0, "means", &[1.0]);
+        edit.offset(2, "means", &[1.0, 2.0, 3.0]);
+    };
+    assert!(refused(&mut optimized, &offsets).contains("new row 0 changes 1 values of `means`"));
+    let sets = |edit: &mut RowEdit| {
+        edit.set(1, "means", &[1.0, 2.0, 3.0]);
+        edit.set(2, "means", &[1.0]);
+    };
+    assert!(refused(&mut optimized, &sets).contains("new row 1 changes 3 values"));
+    assert!(refused(&mut optimized, &|edit| edit.retain(|_| false)).contains("no Gaussian"));
+    let mut nowhere = RowEdit::of_row_set(7);
+    nowhere.push(0, Moments::Keep);
+    let message = optimized.edit_rows(&nowhere).unwrap_err().to_string();
+    assert!(message.contains("no row set 7"), "{message}");
+}
+
+/// What waits in the old model does not reach the restored one.
+#[test]
+fn waiting_gradients_are_those_of_the_restored_state() {
+    let device = Device::flex().autodiff();
+    let inner = device.clone().without_autodiff();
+    let saved = optimized(&device).save().unwrap();
+    let mut waiting = optimized(&device);
+    step(&mut waiting, FieldStep::Accumulate);
+    waiting.restore(saved, &inner).unwrap();
+    step(&mut waiting, FieldStep::Step(1.0));
+    let mut fresh = optimized(&device);
+    step(&mut fresh, FieldStep::Step(1.0));
+    let moments = |model: &Optimized<Model>| {
+        model.save().unwrap().tensors["means.moment_1"]
+            .try_to_vec::<f32>()
+            .unwrap()
+    };
+    assert_eq!(moments(&waiting), moments(&fresh));
+}
+
+/// Parameters that are no fields are part of the state too.
+#[test]
+fn parameters_that_are_no_fields_are_saved() {
+    let device = Device::flex().autodiff();
+    let inner = device.clone().without_autodiff();
+    let mut first = model(&device);
+    first.fixed = first.fixed.map(|value| value * 3.0);
+    let first = Optimized::new(first, fields(), |_| SplatAdam::new().into()).unwrap();
+    let mut second = optimized(&device);
+    second.restore(first.save().unwrap(), &inner).unwrap();
+    assert_eq!(values(&second.model().fixed), values(&first.model().fixed));
+}
+
+/// Nothing would be learned of what autodiff does not know.
+#[test]
+fn a_module_that_autodiff_does_not_track_is_refused() {
+    let device = Device::flex();
+    let built = Optimized::of_module(model(&device), 0.1, |_| SplatAdam::new().into());
+    let message = built.map(drop).unwrap_err().to_string();
+    assert!(message.contains("autodiff does not track"), "{message}");
 }

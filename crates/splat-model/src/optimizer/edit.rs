@@ -1,7 +1,7 @@
 //! Edits of moments, on the device, for the optimisers of the Adam family.
 
 use burn::optim::{Adam, AdamState, AdamW, AdamWState, AdaptiveMomentumState, Optimizer};
-use burn::tensor::{Int, Tensor};
+use burn::tensor::{Bool, Int, Tensor};
 
 use super::field_optimizer::StateRecord;
 
@@ -9,12 +9,12 @@ use super::field_optimizer::StateRecord;
 #[derive(Debug, Clone)]
 #[expect(clippy::large_enum_variant, reason = "a handful exist at a time")]
 pub enum MomentEdit {
-    /// Row i continues row `source[i]` where `keep[i]` is one; where it is zero it starts anew.
+    /// Row i continues row `source[i]`, or starts anew where `restarts[i]`.
     Gather {
         /// `[N_new]`, indices into the old rows.
         source: Tensor<1, Int>,
-        /// `[N_new]`, one or zero.
-        keep: Tensor<1>,
+        /// `[N_new]`.
+        restarts: Tensor<1, Bool>,
     },
     /// All rows start anew.
     Restart,
@@ -24,8 +24,12 @@ impl MomentEdit {
     /// The moment `[N, width]` after the edit, `[N_new, width]`.
     pub fn apply(&self, moment: Tensor<2>) -> Tensor<2> {
         match self {
-            Self::Gather { source, keep } => {
-                moment.select(0, source.clone()) * keep.clone().unsqueeze_dim(1)
+            Self::Gather { source, restarts } => {
+                let [_, width] = moment.dims();
+                let moment = moment.select(0, source.clone());
+                // Filled, not multiplied by zero, which would leave a NaN.
+                let restarts = restarts.clone().unsqueeze_dim::<2>(1).repeat_dim(1, width);
+                moment.mask_fill(restarts, 0.0)
             }
             Self::Restart => moment.zeros_like(),
         }

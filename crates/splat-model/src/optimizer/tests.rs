@@ -2,7 +2,7 @@
 
 use burn::optim::momentum::MomentumConfig;
 use burn::optim::{AdamConfig, AdamWConfig, RmsPropConfig, SgdConfig};
-use burn::tensor::{Device, Int, Tensor};
+use burn::tensor::{Device, Int, Tensor, TensorData};
 
 use super::*;
 
@@ -61,10 +61,10 @@ fn first(rows: &[usize], device: &Device) -> Tensor<2> {
     Tensor::<1>::from_floats(values.as_slice(), device).reshape([rows.len(), 2])
 }
 
-fn gather(source: &[i32], keep: &[f32], device: &Device) -> MomentEdit {
+fn gather(source: &[i32], restarts: &[bool], device: &Device) -> MomentEdit {
     MomentEdit::Gather {
         source: Tensor::<1, Int>::from_ints(source, device),
-        keep: Tensor::from_floats(keep, device),
+        restarts: Tensor::from_bool(TensorData::from(restarts), device),
     }
 }
 
@@ -79,7 +79,7 @@ fn moments_follow_their_rows() {
             value = step(&mut edited, value, &[0, 1, 2], at);
             expected = step(&mut straight, expected, &[2, 1], at);
         }
-        edited.edit_rows(&gather(&[2, 1], &[1.0, 1.0], &device));
+        edited.edit_rows(&gather(&[2, 1], &[false, false], &device));
         value = value.select(0, Tensor::from_ints([2, 1], &device));
         for at in 3..6 {
             value = step(&mut edited, value, &[2, 1], at);
@@ -95,7 +95,7 @@ fn rows_that_start_anew_have_no_moments() {
     let mut adam = FieldOptimizer::from(SplatAdam::new());
     let value = step(&mut adam, first(&[0, 1, 2], &device), &[0, 1, 2], 0);
     let before = adam.save().tensors["moment_1"].try_to_vec::<f32>().unwrap();
-    adam.edit_rows(&gather(&[2, 1, 1], &[1.0, 1.0, 0.0], &device));
+    adam.edit_rows(&gather(&[2, 1, 1], &[false, false, true], &device));
     let after = adam.save().tensors["moment_1"].try_to_vec::<f32>().unwrap();
     assert_eq!(
         after,
@@ -148,4 +148,13 @@ fn records_are_put_under_names_and_taken_out_again() {
     record.put_under("models", inner.clone());
     assert_eq!(record.take_under("model"), inner);
     assert_eq!(record.scalars.keys().collect::<Vec<_>>(), ["models.time"]);
+}
+
+/// A row that starts anew has zeros, whatever its moments were.
+#[test]
+fn a_moment_that_is_not_a_number_does_not_survive_a_restart() {
+    let device = Device::flex();
+    let moment = Tensor::<2>::from_floats([[f32::NAN, 1.0], [2.0, f32::INFINITY]], &device);
+    let edited = gather(&[0, 1], &[true, true], &device).apply(moment);
+    assert_eq!(values(edited), [0.0; 4]);
 }

@@ -58,10 +58,10 @@ impl<S: RecordState + Clone> RecordState for HostState<S> {
     fn state_unflatten(prefix: &str, src: &mut StateSource, device: &Device) -> Option<Self> {
         let rows = usize::try_from(src.take_scalar(prefix, "rows")?).ok()?;
         let inner = burn::optim::join_path(prefix, "inner");
-        Some(Self {
-            rows,
-            inner: S::state_unflatten(&inner, src, device),
-        })
+        // What there is must be a state of this optimiser.
+        let has_state = src.has_under(&inner);
+        let inner = S::state_unflatten(&inner, src, device);
+        (inner.is_some() || !has_state).then_some(Self { rows, inner })
     }
 }
 

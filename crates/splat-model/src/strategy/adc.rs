@@ -14,7 +14,7 @@ use tracing::trace_span;
 use super::{Refinement, ScreenView, ScreenWants, StepContext, StepInfo, Strategy};
 use crate::optimizer::StateRecord;
 use crate::rows::{Moments, RowEdit};
-use crate::{Optimized, SplatModel};
+use crate::{Field, Optimized, SplatModel};
 
 /// Settings of adaptive density control. Milestones are stated for a run of 30,000 steps and shrink
 /// with shorter runs. Intervals do not: statistics need their hundred views, and opacities their
@@ -115,7 +115,8 @@ pub struct Adc {
 }
 
 impl Adc {
-    /// A strategy for one run.
+    /// A strategy for one run. Without `max_gaussians` nothing limits growth; the trainer's own,
+    /// which it makes where no strategy is given, takes a limit from the photos.
     pub fn new(settings: AdcSettings) -> Self {
         Self {
             settings,
@@ -222,8 +223,37 @@ impl Adc {
 }
 
 impl<M: SplatModel> Strategy<M> for Adc {
+    /// With its settings, apart from the limit of growth, which a resumed run may change.
     fn name(&self) -> String {
-        "adc".to_owned()
+        let settings = AdcSettings {
+            max_gaussians: None,
+            ..self.settings.clone()
+        };
+        format!("adc with {settings:?}")
+    }
+
+    fn check(&self, fields: &[Field]) -> Result<(), String> {
+        let needed = ["means", "log_scales", "quats", "opacity_logits"];
+        let has = |name: &&str| fields.iter().any(|field| field.name == **name);
+        if let Some(name) = needed.iter().find(|name| !has(name)) {
+            return Err(format!("adaptive density control needs a field `{name}`"));
+        }
+        let AdcSettings {
+            every,
+            reset_every,
+            reset_opacity,
+            prune_opacity,
+            ..
+        } = self.settings;
+        if every == 0 || reset_every == 0 {
+            return Err("`every` and `reset_every` must be at least 1".to_owned());
+        }
+        if !(0.0 < reset_opacity && reset_opacity < 1.0 && prune_opacity < reset_opacity) {
+            return Err(format!(
+                "`reset_opacity` is {reset_opacity} and `prune_opacity` {prune_opacity}; a reset must leave opacities between pruning and 1"
+            ));
+        }
+        Ok(())
     }
 
     fn screen_wants(&self, at: &StepInfo) -> ScreenWants {
@@ -459,6 +489,7 @@ mod tests {
             let gradient = Tensor::<3>::from_floats([[first, second]], &device);
             let packed = Tensor::ones([1, 2, 9], &device);
             let view = ScreenView {
+                view: 0,
                 projected: splat_ops::Projected::from_packed(packed, size).unwrap(),
                 gradient: Some(gradient),
             };

@@ -47,9 +47,12 @@ impl ScreenWants {
 /// What a training view of a step left on the screen.
 #[derive(Debug)]
 pub struct ScreenView {
+    /// Index of the view among those that are trained on.
+    pub view: usize,
     /// The splats.
     pub projected: Projected,
-    /// Gradient `[C, N, 9]` of their packed rows, where the strategy wanted it.
+    /// Gradient `[C, N, 9]` of their packed rows, of the loss of this view alone, where the
+    /// strategy wanted it.
     pub gradient: Option<Tensor<3>>,
 }
 
@@ -58,6 +61,8 @@ pub struct ScreenView {
 pub struct Pass<'a, M> {
     /// The step, counted from 0.
     pub at: StepInfo,
+    /// Index of the view among those that are trained on.
+    pub view: usize,
     /// The model.
     pub model: &'a M,
     /// Its splats on the screen.
@@ -144,6 +149,15 @@ pub trait Strategy<M: SplatModel>: Send {
         core::any::type_name::<Self>().to_owned()
     }
 
+    /// Checks, before the run, that it can work with the settings that it has on a model of these
+    /// fields.
+    ///
+    /// # Errors
+    /// What is wrong, in a line.
+    fn check(&self, _fields: &[Field]) -> Result<(), String> {
+        Ok(())
+    }
+
     /// The settings of the first Gaussians, given those of the run.
     fn first_gaussians(&self, settings: &InitSettings) -> InitSettings {
         settings.clone()
@@ -160,11 +174,11 @@ pub trait Strategy<M: SplatModel>: Send {
     }
 
     /// Names of the terms that [`loss_terms`](Self::loss_terms) adds to the loss.
-    fn loss_term_names(&self) -> &'static [&'static str] {
-        &[]
+    fn loss_term_names(&self) -> Vec<String> {
+        Vec::new()
     }
 
-    /// Terms added to the loss, each `[1]`, its weight in it: one for each name.
+    /// Terms added to the loss: one for each name, each of shape `[1]`, already weighted.
     ///
     /// # Errors
     /// As those of the ops that it uses.
@@ -178,6 +192,7 @@ pub trait Strategy<M: SplatModel>: Send {
     }
 
     /// Called after the backward pass and before the optimiser: gradients may be read and changed.
+    /// Rows may not be edited here, because the gradients belong to the rows that there are.
     ///
     /// # Errors
     /// As those of the ops that it uses.
@@ -185,14 +200,15 @@ pub trait Strategy<M: SplatModel>: Send {
         Ok(())
     }
 
-    /// Called after the optimiser, but for the last step of a run: what it would add would never be
-    /// trained. Returns what was done where it was time to do something.
+    /// Called after the optimiser, except after the last step of a run: what it would add would
+    /// never be trained. Returns what was done where it was time to do something.
     ///
     /// # Errors
     /// As those of the ops that it uses.
     fn after_step(&mut self, context: &mut StepContext<M>) -> Result<Option<Refinement>, OpError>;
 
-    /// What a checkpoint must keep of it.
+    /// What a checkpoint must keep of it: numbers, and tensors of floats, which are kept in single
+    /// precision and must be finite.
     ///
     /// # Errors
     /// When the device fails.

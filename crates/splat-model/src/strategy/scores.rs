@@ -18,6 +18,20 @@ pub fn weighted_contributions<M: SplatModel>(
     settings: &RenderSettings,
     weights: Tensor<4>,
 ) -> Result<Tensor<1>, OpError> {
+    let size = cameras.size;
+    let [count, _, _] = cameras.viewmats.dims();
+    let expected = [count, size.height as usize, size.width as usize, 1];
+    if weights.dims() != expected {
+        return Err(OpError::Shape {
+            op: "weighted_contributions",
+            tensor: "weights",
+            expected: "[C, H, W, 1]",
+            got: weights.dims().to_vec(),
+        });
+    }
+    if model.count() == 0 {
+        return Ok(Tensor::zeros([0], &weights.device().without_autodiff()));
+    }
     let model = model.clone().no_grad();
     let projected = project_gaussians(&model, cameras, settings)?;
     let [count, n, _] = projected.packed().dims();

@@ -257,14 +257,16 @@ fn a_mask_leaves_pixels_out() {
             let left_out = Tensor::<4>::zeros([b, h - keep, w, 1], &device);
             let mask = Tensor::cat(vec![kept, left_out.clone()], 1);
             // What is left out is anything.
-            let change = (mask.clone() - 1.0).repeat_dim(3, 4) * change;
-            let rendered = (rendered + change).detach().require_grad();
+            let changed = rendered.clone() + change;
+            let left = mask.clone().equal_elem(0.0).repeat_dim(3, 4);
+            let rendered = rendered.mask_where(left, changed).detach().require_grad();
             let measured = crate::photometric_masked(rendered.clone(), target, mask, &args());
             let measured = measured.unwrap();
             outcome(rendered, [measured.l1(), measured.ssim()])
         };
-        let [plain, other] = [0.0, 3.0].map(|change| masked(change, 10));
+        let [plain, other, none] = [0.0, 3.0, f32::NAN].map(|change| masked(change, 10));
         assert_eq!(plain, other);
+        assert_eq!(plain[..2], none[..2]);
         let row = w * 4;
         for image in plain[2].chunks(h * row) {
             assert!(image[10 * row..].iter().all(|gradient| *gradient == 0.0));

@@ -35,6 +35,8 @@ pub struct TrainerBuilder<M: SplatModel = Gaussians> {
     device: Device,
     model: Box<MakeModel<M>>,
     strategy: Option<Box<dyn Strategy<M>>>,
+    /// Whether a strategy was given for another model.
+    lost_strategy: bool,
     optimizer: Box<MakeOptimizer>,
     hooks: Hooks,
     loss: Option<LossTerms>,
@@ -51,6 +53,7 @@ impl Trainer {
             device: Device::default(),
             model: Box::new(Gaussians::from_data),
             strategy: None,
+            lost_strategy: false,
             optimizer: Box::new(|_| None),
             hooks: Hooks::default(),
             loss: None,
@@ -73,6 +76,7 @@ impl TrainerBuilder {
             device: self.device,
             model: Box::new(make),
             strategy: None,
+            lost_strategy: self.strategy.is_some(),
             optimizer: self.optimizer,
             hooks: self.hooks,
             loss: self.loss,
@@ -103,6 +107,8 @@ impl<M: SplatModel> TrainerBuilder<M> {
     }
 
     /// The optimiser of each field for which this gives one; the others have [`SplatAdam`].
+    /// Gradients are not clipped: `build()` of a Burn configuration leaves its clipping out, and a
+    /// strategy can do it in `before_step`.
     pub fn optimizer(
         mut self,
         optimizer: impl Fn(&Field) -> Option<FieldOptimizer> + Send + 'static,
@@ -186,6 +192,10 @@ impl<M: SplatModel> TrainerBuilder<M> {
     /// strategy or a hook cannot be used, or the checkpoint to resume from is another run's.
     pub fn build(mut self) -> Result<Trainer<M>, TrainError> {
         self.config.validate().map_err(TrainError::Config)?;
+        if self.lost_strategy {
+            let reason = "a strategy was given before the model; give it after `model`, whose type it works on";
+            return Err(TrainError::Setup(reason.into()));
+        }
         self.capture.check_trainable()?;
         check_hook_names(&self.hooks)?;
         let loss = self.loss.take();
@@ -202,14 +212,13 @@ impl<M: SplatModel> TrainerBuilder<M> {
         config.density.max_gaussians = most.or_else(|| Some(default_max_gaussians(&self.capture)));
         let strategy = self.strategy.take();
         let strategy = strategy.unwrap_or_else(|| Box::new(Adc::new(config.density.clone())));
-        let terms = loss
-            .names()
-            .chain(strategy.loss_term_names().iter().copied());
-        let terms: Vec<String> = terms.map(str::to_owned).collect();
+        let mut terms: Vec<String> = loss.names().map(str::to_owned).collect();
+        terms.extend(strategy.loss_term_names());
 
         let resumed = self.resume.take();
         if let Some(checkpoint) = &resumed {
-            let views = checkpoint.check_run(&record, &terms, &strategy.name())?;
+            let hooks: Vec<&str> = self.hooks.0.iter().map(|hook| hook.name()).collect();
+            let views = checkpoint.check_run(&record, &terms, &strategy.name(), &hooks)?;
             if !views.is_empty() {
                 (self.watch.on_warning)(&Warning::PhotosChanged { views });
             }
@@ -223,9 +232,18 @@ impl<M: SplatModel> TrainerBuilder<M> {
             }
         };
         let init = strategy.first_gaussians(&config.init);
+        let with_init = TrainSettings {
+            init: init.clone(),
+            ..record.config.clone()
+        };
+        let wrong = |reason: String| {
+            TrainError::Setup(format!("the strategy {}: {reason}", strategy.name()))
+        };
+        with_init.validate().map_err(wrong)?;
         let splats = first_gaussians(&self.capture, &init, schedule.scene_scale, origin)?;
         let model = (self.model)(&splats, &device);
         let model = optimized(model, &config, schedule.scene_scale, &self.optimizer)?;
+        strategy.check(model.fields()).map_err(wrong)?;
         let mut state = State {
             model,
             strategy,
@@ -255,6 +273,7 @@ impl<M: SplatModel> TrainerBuilder<M> {
             state,
             record,
             losses: LossLog::default(),
+            in_step: false,
             coarse: resolution_schedule::CoarseViews::default(),
         })
     }

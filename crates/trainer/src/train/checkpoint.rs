@@ -47,6 +47,37 @@ pub struct Checkpoint {
     tensors: Vec<SavedTensor>,
 }
 
+/// A number as JSON keeps it to the last bit, whatever it is.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+enum SavedScalar {
+    Int(i64),
+    UInt(u64),
+    FloatBits(u64),
+    Bool(bool),
+}
+
+impl From<Scalar> for SavedScalar {
+    fn from(value: Scalar) -> Self {
+        match value {
+            Scalar::Int(value) => Self::Int(value),
+            Scalar::UInt(value) => Self::UInt(value),
+            Scalar::Float(value) => Self::FloatBits(value.to_bits()),
+            Scalar::Bool(value) => Self::Bool(value),
+        }
+    }
+}
+
+impl From<SavedScalar> for Scalar {
+    fn from(value: SavedScalar) -> Self {
+        match value {
+            SavedScalar::Int(value) => Self::Int(value),
+            SavedScalar::UInt(value) => Self::UInt(value),
+            SavedScalar::FloatBits(bits) => Self::Float(f64::from_bits(bits)),
+            SavedScalar::Bool(value) => Self::Bool(value),
+        }
+    }
+}
+
 /// The part of [`Meta`] that all versions have.
 #[derive(Deserialize)]
 struct Versioned {
@@ -63,8 +94,12 @@ struct Meta {
     origin_bits: [u64; 3],
     /// Name of the strategy.
     strategy: String,
+    /// Names of the hooks, in order.
+    hooks: Vec<String>,
+    /// Number of Gaussians.
+    gaussians: usize,
     /// Numbers of optimisers, strategy and hooks, named as tensors are.
-    scalars: BTreeMap<String, Scalar>,
+    scalars: BTreeMap<String, SavedScalar>,
     history: History,
 }
 
@@ -94,7 +129,16 @@ impl Checkpoint {
                 elapsed_seconds: state.elapsed.as_secs_f64(),
                 origin_bits: state.model.model().origin().map(f64::to_bits),
                 strategy: state.strategy.name(),
-                scalars: record.scalars,
+                hooks: state
+                    .hooks
+                    .0
+                    .iter()
+                    .map(|hook| hook.name().to_owned())
+                    .collect(),
+                gaussians: state.model.model().count(),
+                scalars: (record.scalars.into_iter())
+                    .map(|(name, value)| (name, value.into()))
+                    .collect(),
                 history: state.history.clone(),
             },
             tensors: tensors.collect::<Result<_, _>>()?,
@@ -108,8 +152,7 @@ impl Checkpoint {
 
     /// Number of Gaussians.
     pub fn gaussians(&self) -> usize {
-        let means = self.tensors.iter().find(|(name, ..)| name == check::MEANS);
-        means.map_or(0, |(_, shape, _)| shape[0])
+        self.meta.gaussians
     }
 
     /// Where in the world the means count from.
@@ -130,6 +173,7 @@ impl Checkpoint {
         };
         // What could not be read again must not replace what can.
         check::tensors(&self.tensors)
+            .and_then(|()| check::meta(&self.meta))
             .map_err(|reason| format(format!("the run has left all bounds: {reason}")))?;
         let bytes: Vec<(&str, &[usize], Vec<u8>)> = self
             .tensors
@@ -235,7 +279,9 @@ impl Checkpoint {
         let tensors = tensors.map(|(name, shape, values)| (name, TensorData::new(values, shape)));
         let record = StateRecord {
             tensors: tensors.collect(),
-            scalars: self.meta.scalars,
+            scalars: (self.meta.scalars.into_iter())
+                .map(|(name, value)| (name, value.into()))
+                .collect(),
         };
         let inner = device.clone().without_autodiff();
         let restored = state.restore(record, &inner);

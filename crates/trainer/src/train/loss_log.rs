@@ -16,8 +16,8 @@ const NOT_FINITE_LIMIT: usize = 100;
 pub(super) struct UnreadLoss {
     /// The step, from 1.
     pub(super) step: usize,
-    /// Index of its first view in the capture.
-    pub(super) view: usize,
+    /// Indices of its views in the capture.
+    pub(super) views: Vec<usize>,
     /// Total, then the terms.
     pub(super) values: Vec<Tensor<1>>,
 }
@@ -31,8 +31,8 @@ pub(super) struct LossLog {
 /// What a loss that was read turned out to be.
 pub(super) enum ReadLoss {
     Finite(LossRecord),
-    /// Its step, its view, its value.
-    NotFinite(usize, usize, f32),
+    /// Its step, its views, its value.
+    NotFinite(usize, Vec<usize>, f32),
 }
 
 impl LossLog {
@@ -70,7 +70,7 @@ impl LossLog {
                     total: values[0],
                     terms: values[1..].to_vec(),
                 }),
-                false => ReadLoss::NotFinite(loss.step, loss.view, values[0]),
+                false => ReadLoss::NotFinite(loss.step, loss.views.clone(), values[0]),
             })
             .collect())
     }

@@ -3,12 +3,15 @@
 use std::any::Any;
 use std::time::Duration;
 
-use splat_data::{SceneSettings, SplatData};
+use burn::tensor::Device;
+use splat_data::{SceneSettings, SplatData, View};
 use splat_model::{Gaussians, RenderSettings, SplatModel};
+use splat_ops::OpError;
 
 use super::checkpoint::RunRecord;
 use super::state::State;
 use super::{Checkpoint, CheckpointError, History};
+use crate::evaluate::{Scores, evaluate_with};
 use crate::hooks::Hook;
 
 /// Where a run stands, for whoever shows it.
@@ -44,7 +47,8 @@ pub struct Trained<M: SplatModel = Gaussians> {
 }
 
 impl<M: SplatModel> Trained<M> {
-    /// The scene, with the settings that it must be rendered with.
+    /// The scene, with the settings that it must be rendered with. What hooks do to cameras,
+    /// background or picture is not part of it.
     pub fn to_data(&self) -> SplatData {
         SplatData {
             settings: self.settings.clone(),
@@ -59,6 +63,27 @@ impl<M: SplatModel> Trained<M> {
     /// When the device fails.
     pub fn checkpoint(&self) -> Result<Checkpoint, CheckpointError> {
         Checkpoint::of(&self.state, &self.run)
+    }
+
+    /// Scores views as the run does for its own curve: with what its hooks do.
+    ///
+    /// # Errors
+    /// When an op refuses its input, or the device fails.
+    pub fn evaluate(
+        &self,
+        views: &[&View],
+        device: &Device,
+        each: impl FnMut(&View, Vec<f32>),
+    ) -> Result<Scores, OpError> {
+        let hooks = &self.state.hooks;
+        evaluate_with(
+            &self.model,
+            views,
+            &self.render_settings,
+            device,
+            hooks,
+            each,
+        )
     }
 
     /// The first hook of this type, as training left it.

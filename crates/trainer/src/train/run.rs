@@ -130,11 +130,11 @@ impl<M: SplatModel> Trainer<M> {
         }
     }
 
-    /// Keeps what was done before a step that failed, if there is a place for it. A loss that is
-    /// not finite is no reason to replace a state of before it.
+    /// Keeps what was done before a step that failed, if there is a place for it and nothing of the
+    /// step was done. A loss that is not finite is no reason to replace a state of before it.
     fn rescue(&mut self, error: &TrainError) {
         let diverged = matches!(error, TrainError::NotFinite { .. });
-        if self.state.step > 0 && !diverged {
+        if self.state.step > 0 && !diverged && !self.in_step {
             // What cannot be read any more is not what is to be kept.
             let _ = self.read_losses();
             self.save();
@@ -150,7 +150,12 @@ impl<M: SplatModel> Trainer<M> {
         let Capture { views, split, .. } = &*self.capture;
         let mut order = views::ViewOrder::new(self.config.seed, split.train.len());
         let name = |view: usize| views[split.train[view]].name.clone();
-        let found = course.inspect(split.train.len(), |step| order.at(step), name);
+        // The loss of several views tells of none of them.
+        let views = match self.config.views_per_step {
+            1 => split.train.len(),
+            _ => 0,
+        };
+        let found = course.inspect(views, |step| order.at(step), name);
         found.into_iter().for_each(|warning| self.warn(warning));
     }
 

@@ -31,7 +31,8 @@ pub struct TrainSettings {
     pub steps: usize,
     /// Seed of every random draw. Default 0.
     pub seed: u64,
-    /// Photos are area-averaged by this factor. Default 1.
+    /// Photos are area-averaged by this factor when the program reads the capture; the library
+    /// trains on the capture as it was loaded. Default 1.
     pub downscale: u32,
     /// Views that a step renders and takes the mean loss of. Default 1.
     pub views_per_step: usize,
@@ -60,7 +61,7 @@ pub struct TrainSettings {
     pub deterministic: bool,
     /// The first Gaussians.
     pub init: InitSettings,
-    /// Learning rates; `rates` in files of before.
+    /// Learning rates; called `rates` in older files.
     #[serde(alias = "rates")]
     pub learning_rates: LearningRates,
     /// Adaptive density control. Where `max_gaussians` is absent, growth ends at seven Gaussians

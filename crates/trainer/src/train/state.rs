@@ -58,8 +58,8 @@ impl<M: SplatModel> State<M> {
             let restored = hook.restore(own, device);
             restored.map_err(|reason| format!("the hook `{}`: {reason}", hook.name()))?;
         }
-        let mut left = hooks.tensors.keys().chain(record.tensors.keys());
-        match left.next() {
+        let left = [&hooks, &record].map(|left| left.tensors.keys().chain(left.scalars.keys()));
+        match left.into_iter().flatten().next() {
             None => Ok(()),
             Some(name) => Err(format!("`{name}` belongs to nothing of this run")),
         }

@@ -21,7 +21,8 @@ use super::state::State;
 use super::training_views::CaptureViews;
 use super::watch::Watch;
 use super::{
-    LossTerms, TargetView, TrainError, TrainSettings, Warning, resolution_schedule, views, warnings,
+    Checkpoint, LossTerms, TargetView, TrainError, TrainSettings, Warning, resolution_schedule,
+    views, warnings,
 };
 use crate::hooks::{HookView, Purpose};
 use crate::photo::pixels_u8;
@@ -57,13 +58,15 @@ pub struct Trainer<M: SplatModel = Gaussians> {
     pub(super) state: State<M>,
     pub(super) record: RunRecord,
     pub(super) losses: LossLog,
+    /// Whether a step is half done.
+    pub(super) in_step: bool,
     pub(super) coarse: resolution_schedule::CoarseViews,
 }
 
 /// A view of a step after its loss was measured.
 struct Measured {
-    /// Index of the view in the capture.
-    view: usize,
+    /// Index of the view among those that are trained on.
+    training_index: usize,
     loss: Tensor<1>,
     terms: Vec<Tensor<1>>,
     projected: Projected,
@@ -75,8 +78,14 @@ impl<M: SplatModel> Trainer<M> {
     /// which also watches, measures and keeps what becomes of it.
     ///
     /// # Errors
-    /// As those of [`run`](Self::run).
+    /// As those of [`run`](Self::run), and after the last step of the run.
     pub fn step(&mut self) -> Result<(), TrainError> {
+        if self.state.step >= self.config.steps {
+            let steps = self.config.steps;
+            return Err(TrainError::Config(format!(
+                "all {steps} steps of the run are done"
+            )));
+        }
         let _span = trace_span!("step").entered();
         let start = Instant::now();
         keep_awake(&self.device);
@@ -87,6 +96,20 @@ impl<M: SplatModel> Trainer<M> {
         }
         self.state.elapsed += start.elapsed();
         Ok(())
+    }
+
+    /// The state to resume from, with all losses so far.
+    ///
+    /// # Errors
+    /// When the device fails, or a step ended in the middle by an error.
+    pub fn checkpoint(&mut self) -> Result<Checkpoint, TrainError> {
+        if self.in_step {
+            return Err(TrainError::Setup(
+                "a step failed half way, which is no state to go on from".into(),
+            ));
+        }
+        self.read_losses()?;
+        Ok(Checkpoint::of(&self.state, &self.record)?)
     }
 
     /// Size of the scene, from which every length of the run follows.
@@ -116,17 +139,32 @@ impl<M: SplatModel> Trainer<M> {
         let mut gradients = trace_span!("backward").in_scope(|| loss.backward());
         let screen: Vec<ScreenView> = screen
             .into_iter()
-            .map(|(projected, probe)| ScreenView {
+            .map(|(view, projected, probe)| ScreenView {
+                view,
                 projected,
-                gradient: probe.and_then(|probe| probe.grad_remove(&mut gradients)),
+                gradient: probe
+                    .and_then(|probe| probe.grad_remove(&mut gradients))
+                    // Of the view's own loss, of which that of the step is a share.
+                    .map(|gradient| match count {
+                        1 => gradient,
+                        _ => gradient * count as f64,
+                    }),
             })
             .collect();
-        self.state.hooks.step(&mut gradients, &at)?;
         let mut fields = self.state.model.gradients(&mut gradients);
-        drop(gradients);
+        let edits = self.state.model.edits();
+        // From here on an error leaves a step half done, which is no state to go on from.
+        self.in_step = true;
         self.strategy(&at, &mut fields, &screen, Moment::Before)?;
+        if self.state.model.edits() != edits {
+            return Err(TrainError::Setup(format!(
+                "the strategy {} edited rows in `before_step`, where gradients belong to the old ones; edit in `after_step`",
+                self.state.strategy.name()
+            )));
+        }
+        self.state.hooks.step(&mut gradients, &at)?;
         // The optimisers need nothing of the picture.
-        drop(screen);
+        drop((screen, gradients));
         self.step_fields(fields, &at)?;
         self.losses.push(unread);
         self.state.step += 1;
@@ -138,6 +176,7 @@ impl<M: SplatModel> Trainer<M> {
             };
             self.strategy(&done, &mut FieldGradients::new(), &[], Moment::After)?;
         }
+        self.in_step = false;
         Ok(())
     }
 
@@ -185,17 +224,17 @@ impl<M: SplatModel> Trainer<M> {
         if !names.is_empty() {
             let pass = Pass {
                 at: *at,
+                view: training_index,
                 model,
                 projected: &projected,
                 rendered: &rendered,
             };
             let added = self.state.strategy.loss_terms(&pass)?;
-            if added.len() != names.len() {
+            if added.len() != names.len() || added.iter().any(|term| term.dims() != [1]) {
+                let shapes: Vec<_> = added.iter().map(Tensor::dims).collect();
                 return Err(TrainError::Setup(format!(
-                    "the strategy {} names {} loss terms and gives {}",
-                    self.state.strategy.name(),
-                    names.len(),
-                    added.len()
+                    "the strategy {} names the loss terms {names:?} and gives tensors of shapes {shapes:?}; give one of [1] for each name",
+                    self.state.strategy.name()
                 )));
             }
             for term in added {
@@ -207,7 +246,7 @@ impl<M: SplatModel> Trainer<M> {
             return Err(TrainError::Loss("does not depend on the rendered image"));
         }
         Ok(Measured {
-            view: index,
+            training_index,
             loss,
             terms,
             projected,
@@ -216,30 +255,26 @@ impl<M: SplatModel> Trainer<M> {
     }
 
     /// The mean loss of the views of a step, its values to be logged, and what is on the screens.
-    #[expect(clippy::type_complexity, reason = "taken apart at once")]
-    fn together(
-        &self,
-        measured: Vec<Measured>,
-        at: &StepInfo,
-    ) -> Result<(Tensor<1>, UnreadLoss, Vec<(Projected, Option<Tensor<3>>)>), TrainError> {
+    fn together(&self, measured: Vec<Measured>, at: &StepInfo) -> Result<Together, TrainError> {
         let count = measured.len();
         let share = 1.0 / count as f64;
         let mut screen = Vec::with_capacity(count);
-        let mut sums: Option<(usize, Tensor<1>, Vec<Tensor<1>>)> = None;
+        let mut views = Vec::with_capacity(count);
+        let mut sums: Option<(Tensor<1>, Vec<Tensor<1>>)> = None;
         for one in measured {
-            screen.push((one.projected, one.probe));
+            views.push(self.capture.split.train[one.training_index]);
+            screen.push((one.training_index, one.projected, one.probe));
             sums = Some(match sums {
-                None => (one.view, one.loss, one.terms),
-                Some((view, loss, terms)) => {
+                None => (one.loss, one.terms),
+                Some((loss, terms)) => {
                     let terms = terms.into_iter().zip(one.terms).map(|(a, b)| a + b);
-                    (view, loss + one.loss, terms.collect())
+                    (loss + one.loss, terms.collect())
                 }
             });
         }
-        let Some((view, mut loss, mut terms)) = sums else {
-            return Err(TrainError::Config(
-                "`views_per_step` must be at least 1".into(),
-            ));
+        let Some((mut loss, mut terms)) = sums else {
+            let reason = "`views_per_step` must be at least 1";
+            return Err(TrainError::Config(reason.into()));
         };
         if count > 1 {
             loss = loss * share;
@@ -249,7 +284,7 @@ impl<M: SplatModel> Trainer<M> {
         values.extend(terms);
         let unread = UnreadLoss {
             step: at.step + 1,
-            view,
+            views,
             values,
         };
         Ok((loss, unread, screen))
@@ -284,8 +319,10 @@ impl<M: SplatModel> Trainer<M> {
             Moment::Before => self.state.strategy.before_step(&mut context),
             Moment::After => {
                 let _density = trace_span!("density").entered();
-                if self.state.strategy.after_step(&mut context)?.is_some() {
-                    let count = self.state.model.model().count();
+                let refined = self.state.strategy.after_step(&mut context)?.is_some();
+                let count = self.state.model.model().count();
+                let before = self.state.history.counts.last().map(|(_, count)| *count);
+                if refined || before != Some(count) {
                     self.state.history.counts.push((at.step, count));
                 }
                 Ok(())
@@ -314,8 +351,11 @@ impl<M: SplatModel> Trainer<M> {
         for read in self.losses.read(self.state.history.terms.len())? {
             match read {
                 ReadLoss::Finite(record) => self.state.history.losses.push(record),
-                ReadLoss::NotFinite(step, view, value) => {
-                    let view = self.capture.views[view].name.clone();
+                ReadLoss::NotFinite(step, views, value) => {
+                    let names = views
+                        .iter()
+                        .map(|view| self.capture.views[*view].name.as_str());
+                    let view = names.collect::<Vec<_>>().join(", ");
                     let last = self.state.history.losses.last();
                     check_finite(step, &view, value, last, self.config.steps)?;
                     self.warn(Warning::LossNotFinite { view, step });
@@ -325,6 +365,14 @@ impl<M: SplatModel> Trainer<M> {
         Ok(())
     }
 }
+
+/// The loss of a step, its values to be logged, and of each view its index, its splats and the
+/// probe of their gradients.
+type Together = (
+    Tensor<1>,
+    UnreadLoss,
+    Vec<(usize, Projected, Option<Tensor<3>>)>,
+);
 
 /// When the strategy looks.
 enum Moment {

@@ -4,48 +4,25 @@
 
 use burn_pack::Scalar;
 
-use super::{History, Meta, SavedTensor};
+use super::{History, Meta, SavedScalar, SavedTensor};
 use crate::train::settings::MOST_STEPS;
 
 /// More is no run but a damaged file: 300 years.
 const LONGEST_SECONDS: f64 = 1e10;
-/// The means, which every model has.
-pub(super) const MEANS: &str = "model.means";
+/// Beginning of the names of the model's tensors and numbers.
+const MODEL: &str = "model.";
 /// End of the name of an optimiser's count of steps.
 const TIME: &str = ".time";
 
-/// Tensors: there are means, the fields that every model of Gaussians has are as wide as they are,
-/// and all have numbers in them.
+/// Tensors: there is a model, and all have numbers in them.
 pub(super) fn tensors(tensors: &[SavedTensor]) -> Result<(), String> {
-    let means = tensors.iter().find(|(name, ..)| name == MEANS);
-    let n = match means.map(|(_, shape, _)| shape.as_slice()) {
-        Some([n, 3]) if *n > 0 => *n,
-        _ => {
-            return Err(format!(
-                "tensor `{MEANS}` of shape [N, 3] with N > 0 is missing"
-            ));
-        }
-    };
-    for (name, shape, values) in tensors {
-        let fits = match (
-            name.strip_prefix("model.").unwrap_or_default(),
-            shape.as_slice(),
-        ) {
-            ("means" | "log_scales" | "sh0", shape) => shape == [n, 3],
-            ("quats", shape) => shape == [n, 4],
-            ("opacity_logits", shape) => shape == [n, 1],
-            ("sh_rest", [rows, 9 | 24 | 45]) => *rows == n,
-            ("sh_rest", _) => false,
-            _ => true,
-        };
-        if !fits {
-            return Err(format!(
-                "tensor `{name}` has shape {shape:?} beside {n} means"
-            ));
-        }
+    if !tensors.iter().any(|(name, ..)| name.starts_with(MODEL)) {
+        return Err("no tensor of a model (`model.…`) is there".to_owned());
+    }
+    for (name, _, values) in tensors {
         // Opacities of 0 and 1 and flat Gaussians are infinite here, and can be.
         let may_be_infinite = matches!(name.as_str(), "model.opacity_logits" | "model.log_scales");
-        let is_square = name.ends_with(".moment_2");
+        let is_square = name.starts_with(MODEL) && name.ends_with(".moment_2");
         let bad = |value: &f32| {
             value.is_nan()
                 || (value.is_infinite() && !may_be_infinite)
@@ -73,8 +50,9 @@ pub(super) fn meta(meta: &Meta) -> Result<(), String> {
     if !origin.iter().all(|x| x.is_finite()) {
         return Err(format!("`origin_bits` are those of {origin:?}"));
     }
-    let late = |(name, value): &(&String, &Scalar)| {
-        name.ends_with(TIME) && !usize::try_from(**value).is_ok_and(|time| time <= meta.step)
+    let late = |(name, value): &(&String, &SavedScalar)| {
+        let time = usize::try_from(Scalar::from(**value));
+        name.starts_with(MODEL) && name.ends_with(TIME) && !time.is_ok_and(|time| time <= meta.step)
     };
     if let Some((name, value)) = meta.scalars.iter().find(late) {
         return Err(format!(

@@ -79,6 +79,7 @@ impl Checkpoint {
         run: &RunRecord,
         terms: &[String],
         strategy: &str,
+        hooks: &[&str],
     ) -> Result<Vec<String>, CheckpointError> {
         self.check_settings(&run.config)?;
         let was = &self.meta.run.capture;
@@ -93,6 +94,12 @@ impl Checkpoint {
             return Err(CheckpointError::OtherSettings {
                 path: self.path.clone(),
                 difference: format!("the strategy {}, not {strategy}", self.meta.strategy),
+            });
+        }
+        if self.meta.hooks != hooks {
+            return Err(CheckpointError::OtherSettings {
+                path: self.path.clone(),
+                difference: format!("the hooks {:?}, not {hooks:?}", self.meta.hooks),
             });
         }
         if self.meta.history.terms != terms {

@@ -101,7 +101,7 @@ fn a_run_that_cannot_have_been_is_refused() {
     assert!(damaged(&|meta| meta.elapsed_seconds = -1.0).contains("`elapsed_seconds`"));
     let late = |meta: &mut Meta| {
         let time = Scalar::UInt(u64::MAX);
-        meta.scalars.insert("model.means.time".into(), time);
+        meta.scalars.insert("model.means.time".into(), time.into());
     };
     assert!(damaged(&late).contains("`model.means.time`"));
 }

@@ -104,8 +104,8 @@ impl<M: SplatModel> Strategy<M> for Everything {
         ScreenWants::gradients()
     }
 
-    fn loss_term_names(&self) -> &'static [&'static str] {
-        &["opacity"]
+    fn loss_term_names(&self) -> Vec<String> {
+        vec!["opacity".into()]
     }
 
     fn loss_terms(&self, pass: &Pass<M>) -> Result<Vec<Tensor<1>>, OpError> {
@@ -370,4 +370,190 @@ fn a_run_does_what_it_is_told() {
         .unwrap()
         .run();
     assert_eq!(trained.unwrap().steps, 2);
+}
+
+/// Does one thing wrong, or grows by screen gradients alone.
+#[derive(Clone, Copy, PartialEq)]
+enum Wrong {
+    WideTerm,
+    EditBefore,
+    AllRows,
+    FirstOpacity,
+    FailsAfterHook,
+}
+
+impl Strategy<Gaussians> for Wrong {
+    fn first_gaussians(&self, settings: &InitSettings) -> InitSettings {
+        match self {
+            Self::FirstOpacity => settings.clone().with_opacity(2.0),
+            _ => settings.clone(),
+        }
+    }
+
+    fn loss_term_names(&self) -> Vec<String> {
+        match self {
+            Self::WideTerm => vec!["wide".into()],
+            _ => vec![],
+        }
+    }
+
+    fn loss_terms(&self, pass: &Pass<Gaussians>) -> Result<Vec<Tensor<1>>, OpError> {
+        Ok(vec![pass.model.opacities()])
+    }
+
+    fn before_step(&mut self, context: &mut StepContext<Gaussians>) -> Result<(), OpError> {
+        if *self == Self::EditBefore {
+            let mut edit = RowEdit::identity(context.model.model().len());
+            edit.relocate(0, 1, Moments::Keep);
+            context.model.edit_rows(&edit)?;
+        }
+        Ok(())
+    }
+
+    fn after_step(
+        &mut self,
+        context: &mut StepContext<Gaussians>,
+    ) -> Result<Option<Refinement>, OpError> {
+        match self {
+            Self::AllRows => context.model.edit_rows(&RowEdit::default())?,
+            Self::FailsAfterHook if context.at.step == 3 => {
+                return Err(OpError::Argument {
+                    op: "strategy",
+                    what: "no more".into(),
+                });
+            }
+            _ => {}
+        }
+        Ok(None)
+    }
+}
+
+/// What a strategy must not do ends the run by name, and nothing of a half step is kept.
+#[test]
+fn what_a_strategy_must_not_do_is_named() {
+    let run = |strategy: Wrong| {
+        let kept = Arc::new(Mutex::new(Vec::new()));
+        let keep = kept.clone();
+        let trainer =
+            builder()
+                .strategy(strategy)
+                .autosave(Duration::from_secs(3600), move |checkpoint| {
+                    keep.lock().unwrap().push(checkpoint.step());
+                    Ok(())
+                });
+        let ended = trainer.build().and_then(Trainer::run).map(drop);
+        assert!(kept.lock().unwrap().is_empty());
+        ended.unwrap_err().to_string()
+    };
+    for (wrong, words) in [
+        (Wrong::WideTerm, "one of [1]"),
+        (Wrong::EditBefore, "edited rows in `before_step`"),
+        (Wrong::AllRows, "no Gaussian would be left"),
+        (Wrong::FirstOpacity, "`init.opacity`"),
+        (Wrong::FailsAfterHook, "no more"),
+    ] {
+        let message = run(wrong);
+        assert!(message.contains(words), "{message}");
+    }
+    let dropped = builder()
+        .strategy(Wrong::AllRows)
+        .model(Dimmed::new)
+        .build();
+    let message = dropped.map(drop).unwrap_err().to_string();
+    assert!(message.contains("before the model"), "{message}");
+}
+
+/// Density control grows by the gradients of views, however many of them a step has.
+#[test]
+fn density_control_sees_the_gradient_of_a_view_whatever_the_views_of_a_step() {
+    struct Sums(Arc<Mutex<Vec<f32>>>);
+    impl Strategy<Gaussians> for Sums {
+        fn screen_wants(&self, _: &StepInfo) -> ScreenWants {
+            ScreenWants::gradients()
+        }
+        fn before_step(&mut self, context: &mut StepContext<Gaussians>) -> Result<(), OpError> {
+            let gradient = context.screen[0].gradient.clone().unwrap();
+            let sum = gradient.abs().sum().into_scalar::<f32>();
+            self.0.lock().unwrap().push(sum);
+            Ok(())
+        }
+        fn after_step(
+            &mut self,
+            _: &mut StepContext<Gaussians>,
+        ) -> Result<Option<Refinement>, OpError> {
+            Ok(None)
+        }
+    }
+    let first = |views: usize| {
+        let seen = Arc::new(Mutex::new(Vec::new()));
+        let settings = TrainSettings::new()
+            .with_steps(1)
+            .with_views_per_step(views);
+        let trainer = builder().settings(settings).strategy(Sums(seen.clone()));
+        trainer.build().unwrap().run().unwrap();
+        let seen = seen.lock().unwrap();
+        seen[0]
+    };
+    let (one, four) = (first(1), first(4));
+    assert!((four / one - 1.0).abs() < 1e-4, "{one} {four}");
+}
+
+/// Numbers of hooks come back to the last bit, and a run goes on with the hooks that it was begun
+/// with.
+#[test]
+fn hooks_are_part_of_the_run() {
+    struct Number(f64);
+    impl Hook for Number {
+        fn name(&self) -> &str {
+            "number"
+        }
+        fn save(&self) -> Result<StateRecord, OpError> {
+            let mut record = StateRecord::default();
+            record.scalars.insert("own.time".into(), 9usize.into());
+            record.scalars.insert("value".into(), self.0.into());
+            Ok(record)
+        }
+        fn restore(&mut self, record: StateRecord, _: &Device) -> Result<(), String> {
+            let value = record.scalars.get("value").ok_or("`value` is missing")?;
+            self.0 = f64::try_from(*value).map_err(|error| error.to_string())?;
+            Ok(())
+        }
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("checkpoint.safetensors");
+    let settings = || TrainSettings::new().with_steps(2);
+    for value in [0.012702941391274987, f64::INFINITY] {
+        let trainer = builder().settings(settings()).hook(Number(value));
+        let trained = trainer.build().unwrap().run().unwrap();
+        trained.checkpoint().unwrap().save(&path).unwrap();
+        let resumed = builder().settings(settings()).hook(Number(0.0));
+        let resumed = resumed
+            .resume(Checkpoint::load(&path).unwrap())
+            .build()
+            .unwrap();
+        let resumed = resumed.run().unwrap();
+        assert_eq!(
+            resumed.hook::<Number>().unwrap().0.to_bits(),
+            value.to_bits()
+        );
+    }
+    let without = builder()
+        .settings(settings())
+        .resume(Checkpoint::load(&path).unwrap());
+    let message = without.build().map(drop).unwrap_err().to_string();
+    assert!(message.contains("the hooks [\"number\"]"), "{message}");
+}
+
+/// A step more than the run has is an error, and its state can be kept between steps.
+#[test]
+fn whoever_drives_the_loop_ends_with_it() {
+    let mut trainer = builder()
+        .settings(TrainSettings::new().with_steps(2))
+        .build()
+        .unwrap();
+    trainer.step().unwrap();
+    assert_eq!(trainer.checkpoint().unwrap().step(), 1);
+    trainer.step().unwrap();
+    let message = trainer.step().unwrap_err().to_string();
+    assert!(message.contains("all 2 steps"), "{message}");
 }
