@@ -3,7 +3,7 @@
 #
 #   fuzz/run.sh PARSER... SECONDS        fuzz/run.sh all 1800
 #
-# PARSER: colmap_binary, colmap_text, ply, fixture, checkpoint, config, or all. Prints a line a parser; exit status 1 if any
+# PARSER: colmap_binary, colmap_text, ply, fixture, checkpoint, config, gaussians, or all. Prints a line a parser; exit status 1 if any
 # input fails. The same seed (environment variable SEED) repeats a run of one build.
 set -euo pipefail
 cd "$(dirname "$0")/.."

@@ -11,7 +11,7 @@ use splat_fuzz::{Campaign, Failed, Report, TARGETS, Target};
 /// Fuzz the file readers
 #[derive(Debug, Parser)]
 struct Args {
-    /// Readers: colmap_binary, colmap_text, ply, fixture, checkpoint, config; all
+    /// Readers: colmap_binary, colmap_text, ply, fixture, checkpoint, config, gaussians; all
     #[arg(required = true)]
     parsers: Vec<String>,
     /// Time of the processor for each

@@ -47,3 +47,8 @@ fn checkpoint() {
 fn config() {
     runs("config", 300_000);
 }
+
+#[test]
+fn gaussians() {
+    runs("gaussians", 100_000);
+}

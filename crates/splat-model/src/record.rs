@@ -99,7 +99,18 @@ impl Gaussians {
             reason,
         };
         let bytes = std::fs::read(path).map_err(|error| failed(error.to_string()))?;
-        let data = parse(bytes).map_err(failed)?;
+        Self::parse(path, bytes, device)
+    }
+
+    /// [`load`](Self::load) on the content of a file; `path` is for messages.
+    ///
+    /// # Errors
+    /// Those of [`load`](Self::load).
+    pub fn parse(path: &Path, bytes: Vec<u8>, device: &Device) -> Result<Self, RecordError> {
+        let data = parse(bytes).map_err(|reason| RecordError {
+            path: path.to_owned(),
+            reason,
+        })?;
         Ok(Self::from_data(&data, device))
     }
 }

@@ -6,6 +6,7 @@ mod colmap_binary;
 mod colmap_text;
 mod config;
 mod fixture;
+mod gaussians;
 mod ply;
 mod safetensors;
 
@@ -60,14 +61,16 @@ pub struct Memory {
 /// | PLY | 32 | 520 KiB, of which 512 are what the PLY library makes room for before it reads a list |
 /// | gradient fixture | 16 | 8 KiB |
 /// | checkpoint | 32 | 8 KiB |
+/// | Gaussians as burnpack | 32 | 2,056 KiB, of which 2,048 are what the library makes room for |
 /// | settings (TOML), which are at most 1 MiB | 1,024 | 8 KiB |
-pub static TARGETS: [Target; 6] = [
+pub static TARGETS: [Target; 7] = [
     colmap_binary::TARGET,
     colmap_text::TARGET,
     ply::TARGET,
     fixture::TARGET,
     checkpoint::TARGET,
     config::TARGET,
+    gaussians::TARGET,
 ];
 
 /// A bound of so much for each byte and 8 KiB.

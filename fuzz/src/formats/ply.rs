@@ -52,7 +52,7 @@ const WORDS: [&str; 22] = [
     "end_header",
 ];
 
-fn scene(count: usize, sh_degree: usize) -> SplatData {
+pub(super) fn scene(count: usize, sh_degree: usize) -> SplatData {
     let mut scene = SplatData {
         sh_degree,
         ..SplatData::default()
@@ -151,16 +151,15 @@ fn parse(input: &Input) -> Result<Follow, String> {
         if scene.len() > 100 {
             return false;
         }
-        let device = Device::flex();
-        let gaussians = Gaussians::from_data(&scene, &device);
-        let view = &capture().views[0];
-        let cameras =
-            CameraTensors::from_camera(&view.camera().relative_to(gaussians.origin), &device);
-        let settings = RenderSettings {
-            sh_degree: scene.sh_degree,
-            ..RenderSettings::default()
-        };
-        let rendered = render(&gaussians, &cameras, &settings);
-        rendered.is_ok_and(|rendered| rendered.image().try_into_vec_as::<f32>().is_ok())
+        renders(&Gaussians::from_data(&scene, &Device::flex()))
     }))
+}
+
+/// Whether a picture comes of it.
+pub(super) fn renders(gaussians: &Gaussians) -> bool {
+    let view = &capture().views[0];
+    let camera = view.camera().relative_to(gaussians.origin);
+    let cameras = CameraTensors::from_camera(&camera, &Device::flex());
+    let rendered = render(gaussians, &cameras, &RenderSettings::default());
+    rendered.is_ok_and(|rendered| rendered.image().try_into_vec_as::<f32>().is_ok())
 }

@@ -39,7 +39,7 @@ pub(in crate::train) fn is_due(step: usize, steps: usize) -> bool {
 
 impl Course<'_> {
     /// Everything that looks wrong. `view_at` names the view of a step (from 0), by an index below
-    /// `views`; `name` gives its photo.
+    /// `views`; `name` gives its photo. With 0 views none is judged.
     pub(in crate::train) fn inspect(
         &self,
         views: usize,
@@ -71,6 +71,9 @@ impl Course<'_> {
         mut view_at: impl FnMut(usize) -> usize,
         name: impl Fn(usize) -> String,
     ) -> Option<Warning> {
+        if views == 0 {
+            return None;
+        }
         let mut losses = vec![Vec::new(); views];
         for record in self.between(self.step / 2, self.step) {
             losses[view_at(record.step - 1)].push(total(record));
