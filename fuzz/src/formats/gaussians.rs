@@ -17,8 +17,8 @@ pub(super) const TARGET: Target = Target {
     mutate,
     parse,
     follow_every: 64,
-    // The library makes room for up to a MiB of entries that a header announces before it finds that
-    // the file ends.
+    // The library makes room for up to a MiB of entries that a header announces before it finds
+    // that the file ends.
     memory: Memory {
         per_byte: 32,
         constant: (2 << 20) + (8 << 10),
