@@ -14,8 +14,8 @@
 use cubecl::prelude::*;
 use splat_core::Activation;
 
+use crate::bytes::{Bytes, Sizes};
 use crate::exp::exp;
-use crate::floor::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 
 /// Floors of the three scales and the opacity of each Gaussian, and of their gradients.

@@ -12,7 +12,7 @@
 use cubecl::prelude::*;
 use splat_core::{AdamRows, AdamStep};
 
-use crate::floor::{Bytes, Sizes};
+use crate::bytes::{Bytes, Sizes};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
 use crate::math::is_finite;
 

@@ -25,11 +25,11 @@ use std::fmt;
 use cubecl::prelude::*;
 use splat_core::TILE_SIDE;
 
-pub use self::capacity::MAX_INTERSECTIONS;
+pub use self::capacity::{MAX_INTERSECTIONS, MAX_SLOT_VALUES};
 use self::capacity::{Room, check_intersections, max_intersections};
 pub(crate) use self::footprint::Footprint;
 use self::lists::Counted;
-use crate::floor::{Bytes, Sizes};
+use crate::bytes::{Bytes, Sizes};
 use crate::launch::Buffer;
 use crate::scan::PendingTotal;
 use crate::work;

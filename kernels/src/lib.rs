@@ -21,6 +21,7 @@
 pub mod activation;
 pub mod adam;
 pub mod blur;
+mod bytes;
 pub mod copy;
 mod device_info;
 pub mod exp;

@@ -21,11 +21,11 @@ use cubecl::prelude::*;
 use self::backward::photometric_gradient;
 use self::forward::{means_of_tiles, photometric_tiles};
 use self::tile::{FIELDS, MOMENTS, PITCH, TILE_HEIGHT, TILE_WIDTH, UNITS};
-use crate::floor::{self, Bytes};
+use crate::bytes::{self, Bytes};
 use crate::launch::{Buffer, CUBE_UNITS, cube_count};
 
 /// Floors of the loss of one view and of its gradient; the photo is of 8 bits.
-pub(crate) fn floor(sizes: &floor::Sizes) -> [Bytes; 2] {
+pub(crate) fn floor(sizes: &bytes::Sizes) -> [Bytes; 2] {
     let values = sizes.pixels() * sizes.channels;
     [
         Bytes {

@@ -31,7 +31,7 @@ use splat_core::{ImageSize, PROJECTED_DEPTH, PROJECTED_WIDTH, ProjectSettings, P
 pub use self::backward::project_backward;
 use self::camera::Camera;
 use self::splat::{Gaussian, project_splat};
-use crate::floor::{Bytes, Sizes};
+use crate::bytes::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 
 /// Image size and [`ProjectSettings`] on the device; `blur` = √e; `reach` = √(2 ln(1/alpha_min)),

@@ -24,6 +24,7 @@ mod backward;
 mod forward;
 mod measure;
 mod pair;
+mod slots;
 mod sums;
 mod tile;
 mod vjp;
@@ -31,24 +32,23 @@ mod vjp;
 use cubecl::prelude::*;
 use splat_core::PROJECTED_WIDTH;
 
-use self::backward::SHAPE_GRADIENTS;
 use self::forward::rasterize_forward;
 pub use self::measure::{Evaluations, Kept, count_evaluations, unordered, variant};
 use self::pair::thresholds;
+use self::slots::SHAPE_GRADIENTS;
 pub use self::sums::Sums;
 use self::tile::Plan;
 pub use self::vjp::rasterize_vjp;
-use crate::floor::{Bytes, Sizes};
-use crate::intersect::{Frames, IntersectError, TileLists, intersect_ahead};
+use crate::bytes::{Bytes, Sizes};
+use crate::intersect::{Frames, IntersectError, MAX_SLOT_VALUES, TileLists, intersect_ahead};
 use crate::launch::{Buffer, cube_count, per_element};
 use crate::math::is_finite;
 
 /// Most channels of one launch; fewer where a unit has many pixels.
 pub const MAX_CHANNELS: usize = 32;
 
-/// Gradients of one intersection that a 32-bit index reaches however many intersections there are;
-/// more of them only of fewer.
-pub const MAX_SLOT_VALUES: usize = SHAPE_GRADIENTS + MAX_CHANNELS / 2;
+/// Half of the channels of a launch, and the shape, are what the lists leave room for.
+const _: () = assert!(MAX_SLOT_VALUES == SHAPE_GRADIENTS + MAX_CHANNELS / 2);
 
 /// Thresholds of the blending, and how its gradients are summed.
 #[derive(Clone, Copy, Debug)]

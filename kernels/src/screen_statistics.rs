@@ -11,7 +11,7 @@
 use cubecl::prelude::*;
 use splat_core::{PROJECTED_EXTENT, PROJECTED_WIDTH};
 
-use crate::floor::{Bytes, Sizes};
+use crate::bytes::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 use crate::math::is_finite;
 

@@ -25,7 +25,7 @@ use cubecl::prelude::*;
 use splat_core::{PROJECTED_EXTENT, PROJECTED_WIDTH, ShColorSettings, sh_coefficient_count};
 
 pub use self::backward::sh_colors_backward;
-use crate::floor::{Bytes, Sizes};
+use crate::bytes::{Bytes, Sizes};
 use crate::launch::{Buffer, F16, F32, HalfBuffer, per_element};
 use crate::math::{Vec3, is_below_zero};
 use crate::sh::{basis, inverse_length, usable_degree};

@@ -10,11 +10,11 @@
 
 use cubecl::prelude::*;
 
-use crate::floor::{Bytes, Sizes};
-use crate::intersect::TILE;
+use crate::bytes::{Bytes, Sizes};
 use crate::launch::{Buffer, cube_count, per_element};
 use crate::planes::plane_size;
 use crate::scan::{cube_exclusive_sum, exclusive_sum};
+use splat_core::TILE_SIDE;
 
 /// Units of a workgroup: 16 counters of each fit well into the 16 KiB of shared memory that every
 /// device has.
@@ -276,7 +276,7 @@ pub fn variant(client: &Client) -> String {
 
 /// Floor of the two sorts of a view: the visible splats by depth, then the intersections by tile.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
-    let tile = u64::from(TILE);
+    let tile = TILE_SIDE as u64;
     let tiles = sizes.width.div_ceil(tile) * sizes.height.div_ceil(tile);
     let passes = |bits: u32| u64::from(bits.div_ceil(sizes.digit_bits.max(1)));
     let pairs =

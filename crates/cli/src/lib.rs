@@ -10,6 +10,8 @@ mod gradcheck;
 mod info;
 mod interrupt;
 mod photos;
+#[cfg(feature = "cpu")]
+mod plots;
 mod render;
 mod report;
 mod scene;

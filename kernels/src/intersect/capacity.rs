@@ -7,7 +7,10 @@ use std::sync::{LazyLock, Mutex, MutexGuard};
 use cubecl::prelude::*;
 
 use super::{Frames, IntersectError};
-use crate::rasterize::MAX_SLOT_VALUES;
+
+/// Gradients of one intersection that a 32-bit index reaches however many intersections there are;
+/// more of them only of fewer. The rasteriser keeps as many (`rasterize.rs` checks it).
+pub const MAX_SLOT_VALUES: usize = 22;
 
 /// Intersections that can be listed: kernels address memory by 32-bit indices, and the backward
 /// pass keeps up to [`MAX_SLOT_VALUES`] floats per intersection.

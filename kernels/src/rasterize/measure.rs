@@ -2,7 +2,7 @@
 
 use cubecl::prelude::*;
 
-use super::backward::SHAPE_GRADIENTS;
+use super::slots::SHAPE_GRADIENTS;
 use super::tile::Plan;
 use super::{RasterizeInputs, RasterizeSettings, RasterizeState, Sums, blend};
 use crate::intersect::Frames;

@@ -13,7 +13,7 @@ use cubecl::ir::Type;
 use cubecl::prelude::*;
 use splat_core::PROJECTED_WIDTH;
 
-use super::backward::SlotLayout;
+use super::slots::SlotLayout;
 
 /// How gradients of one splat from many tiles are summed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]

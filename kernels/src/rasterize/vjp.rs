@@ -4,8 +4,9 @@ use cubecl::prelude::*;
 use splat_core::{PROJECTED_WIDTH, RasterizeTensors};
 
 use super::background::background_gradient;
-use super::backward::{SHAPE_GRADIENTS, SlotLayout, rasterize_backward};
+use super::backward::rasterize_backward;
 use super::pair::thresholds;
+use super::slots::{SHAPE_GRADIENTS, SlotLayout};
 use super::sums::{SlotTargetLaunch, SplatTargetLaunch, TargetArgs, sum_slots};
 use super::tile::Plan;
 use super::{RasterizeInputs, RasterizeSettings, RasterizeState, Sums};

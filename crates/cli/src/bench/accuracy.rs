@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use clap::Args;
 
 use super::{DeviceChoice, Failure, GlobalArgs, device, print, probe_report, write};
+use crate::plots;
 use crate::report::metrics::write_json;
 use crate::report::probe_files;
 use splat_lab::accuracy::report::{Backend, Report};
@@ -46,7 +47,7 @@ pub(super) fn run(args: &AccuracyArgs, global: &GlobalArgs) -> Result<(), Failur
         write(
             folder,
             "accuracy.svg",
-            &report.svg().map_err(Failure::Check)?,
+            &plots::accuracy::svg(&report).map_err(Failure::Check)?,
         )?;
         write(folder, "ACCURACY.md", &page(&report, &backends))?;
     }

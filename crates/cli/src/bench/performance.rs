@@ -8,6 +8,7 @@ use super::input::{CaptureArgs, EXAMPLE};
 use super::{
     Failure, GlobalArgs, cpu_only, print, probe_report, rasterize, scaling, write, write_svg,
 };
+use crate::plots;
 use crate::report::metrics::write_json;
 use crate::report::probe_files;
 use splat_lab::performance::page::PerformanceReport;
@@ -62,8 +63,8 @@ pub(super) fn run(args: &PerformanceArgs, global: &GlobalArgs) -> Result<(), Fai
     }
     if let Some(folder) = &args.report {
         let pictures = [
-            (STEP_SVG, report.step.svg()),
-            (SCALING_SVG, report.scaling.svg()),
+            (STEP_SVG, plots::step::svg(&report.step.rows)),
+            (SCALING_SVG, plots::scaling::svg(&report.scaling.points)),
         ];
         for (name, svg) in pictures {
             write_svg(&folder.join(name), svg)?;

@@ -7,6 +7,7 @@ use std::time::Instant;
 use clap::Args;
 
 use super::{DeviceChoice, Failure, GlobalArgs, chosen, print, write_svg};
+use crate::plots;
 use crate::report::metrics::write_json;
 use crate::report::{probe_files, probe_folder};
 use splat_lab::performance::PerformanceError;
@@ -96,7 +97,7 @@ pub(super) fn run(args: &ScalingArgs, global: &GlobalArgs) -> Result<(), Failure
         write_json(path, &report)?;
     }
     if let Some(path) = &args.svg {
-        write_svg(path, report.svg())?;
+        write_svg(path, plots::scaling::svg(&report.points))?;
     }
     Ok(())
 }

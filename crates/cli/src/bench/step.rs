@@ -7,6 +7,7 @@ use splat_ops::device::device_info;
 
 use super::input::CaptureArgs;
 use super::{Failure, GlobalArgs, chosen, print, write_svg};
+use crate::plots;
 use crate::report::metrics::write_json;
 use crate::report::probe_files;
 use splat_lab::performance::{device_step, step};
@@ -61,7 +62,7 @@ pub(super) fn run(args: &StepArgs, global: &GlobalArgs) -> Result<(), Failure> {
         write_json(path, &report)?;
     }
     if let Some(path) = &args.svg {
-        write_svg(path, report.svg())?;
+        write_svg(path, plots::step::svg(&report.rows))?;
     }
     Ok(())
 }

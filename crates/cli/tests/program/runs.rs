@@ -182,6 +182,7 @@ fn the_printed_commands_work_when_pasted() {
     assert!(scene() == first);
 }
 
+// Longer than a hundred lines: one run, told from its beginning to its end.
 #[test]
 fn a_run_is_gone_on_with_as_it_was_begun_or_not_at_all() {
     let folder = TempDir::new().unwrap();

@@ -5,11 +5,9 @@
 //! estimated error is kept (Ridders 1982). Large steps are exact for smooth functions; small ones
 //! are what is left where a kink is near.
 
-use super::noise::{Extent, Noise};
+use super::noise::Noise;
+use super::sample::{Extent, LEVELS, RATIO, Sample};
 
-/// Steps tried at most. The last is 2^-20 of the first.
-pub(super) const LEVELS: usize = 11;
-pub(super) const RATIO: f64 = 4.0;
 /// Rows of the tableau before it may be trusted.
 const LEAST: usize = 3;
 
@@ -18,17 +16,6 @@ const LEAST: usize = 3;
 pub(super) struct Estimate {
     pub value: f64,
     pub error: f64,
-}
-
-/// What one step gives.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Sample {
-    /// `(f(h) - f(-h)) / 2h`.
-    pub central: f64,
-    /// `(f(h) - 2 f(0) + f(-h)) / h`: the slope on the right minus that on the left.
-    pub jump: f64,
-    /// What changed.
-    pub extent: Extent,
 }
 
 /// The derivative along a line.

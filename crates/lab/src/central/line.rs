@@ -5,8 +5,8 @@ use std::ops::Range;
 use super::CheckError;
 use super::function::Function;
 use super::inputs::Inputs;
-use super::ladder::Sample;
-use super::noise::Extent;
+use super::sample::Extent;
+use super::sample::Sample;
 
 /// Moves of some elements of one input.
 #[derive(Debug, Clone)]

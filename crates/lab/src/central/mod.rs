@@ -44,6 +44,7 @@ mod line;
 mod noise;
 mod outputs;
 mod report;
+mod sample;
 mod search;
 mod settings;
 

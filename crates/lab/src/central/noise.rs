@@ -1,29 +1,9 @@
 //! What rounding makes of differences.
 
-use super::ladder::{LEVELS, RATIO, Sample};
+use super::sample::{Extent, LEVELS, RATIO, Sample};
 
 /// Rounding of two values, halved by the two steps between them.
 const ROUNDING: f64 = 0.5 * f64::EPSILON;
-
-/// The outputs that change along a line.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub(super) struct Extent {
-    /// Root of the sum of their squares, weighted.
-    pub size: f64,
-    /// The same of their weights alone.
-    pub weight: f64,
-}
-
-impl Extent {
-    /// Both. An output that changes at a large step is rounded at a small one too, where it may not
-    /// seem to change.
-    pub(super) fn or(self, other: Self) -> Self {
-        Self {
-            size: self.size.max(other.size),
-            weight: self.weight.max(other.weight),
-        }
-    }
-}
 
 /// What rounding makes of one output's element.
 #[derive(Debug, Clone, Copy, PartialEq)]

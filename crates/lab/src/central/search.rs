@@ -12,8 +12,9 @@ use rand_pcg::Pcg64Mcg;
 use super::judge::Analytic;
 use super::ladder::{Slope, climb_down};
 use super::line::{Line, Probe, sizes};
-use super::noise::{Extent, Noise, noise_at_the_bottom};
+use super::noise::{Noise, noise_at_the_bottom};
 use super::report::{Comparison, Coverage, Finding, Kind, Row};
+use super::sample::Extent;
 use super::{CheckError, Settings};
 use crate::gradcheck::index_of;
 

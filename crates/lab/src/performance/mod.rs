@@ -16,7 +16,7 @@ pub mod scaling;
 mod spread;
 pub mod stages;
 pub mod step;
-mod step_plot;
+mod step_row;
 mod threads;
 mod work;
 

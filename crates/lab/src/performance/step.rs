@@ -10,8 +10,9 @@ use serde::Serialize;
 
 use super::machine::Usage;
 use super::stages::{Recording, Stage};
+pub use super::step_row::StepRow;
 use super::work::sample;
-use super::{Machine, PerformanceError, Spread, Work, all_threads, on_threads, step_plot};
+use super::{Machine, PerformanceError, Spread, Work, all_threads, on_threads};
 use crate::memory::peak_rss_bytes;
 use splat_data::Capture;
 use splat_data::View;
@@ -41,26 +42,6 @@ pub struct StepReport {
     pub rows: Vec<StepRow>,
     /// Most memory that was resident while all this was measured.
     pub peak_rss_bytes: Option<u64>,
-}
-
-/// Steps at one setting.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct StepRow {
-    /// Degree of spherical harmonics.
-    pub sh_degree: usize,
-    /// Threads.
-    pub threads: usize,
-    /// Steps measured.
-    pub steps: usize,
-    /// Time of a step.
-    pub milliseconds: Spread,
-    /// Median time of each stage, in the order in which they end; last what no stage covers.
-    pub stages: Vec<(String, f64)>,
-    /// Processor time of all threads per step; on an idle machine, that of the step times the
-    /// threads, as far as these have work. Absent where the system does not say.
-    pub cpu_milliseconds: Option<f64>,
-    /// Pages of fresh memory per step.
-    pub page_faults: Option<f64>,
 }
 
 /// Measures steps of `capture` at degree 0, with which training begins, and 3, with which it ends;
@@ -264,14 +245,6 @@ impl StepReport {
             Some((row.sh_degree, row.threads, ratio))
         })
         .collect()
-    }
-
-    /// The stages as bars, as SVG.
-    ///
-    /// # Errors
-    /// What the drawing library says.
-    pub fn svg(&self) -> Result<String, String> {
-        step_plot::svg(&self.rows)
     }
 
     /// The tables.

@@ -6,7 +6,7 @@
 use std::fmt::Display;
 use std::path::Path;
 
-use super::colmap::{model_name, pinhole_intrinsics, pinhole_parameters};
+use super::colmap_models::{model_name, pinhole_intrinsics, pinhole_parameters};
 use super::sparse_model::{SparseCamera, SparseImage};
 use super::{CaptureError, Point};
 

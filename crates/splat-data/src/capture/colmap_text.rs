@@ -7,7 +7,7 @@
 use std::path::Path;
 use std::str::{FromStr, SplitAsciiWhitespace};
 
-use super::colmap::{pinhole_intrinsics, pinhole_parameters};
+use super::colmap_models::{pinhole_intrinsics, pinhole_parameters};
 use super::sparse_model::{SparseCamera, SparseImage};
 use super::{CaptureError, CaptureWarning, Point};
 use crate::text::{Excerpt, lines, without_mark};

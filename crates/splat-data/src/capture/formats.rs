@@ -2,19 +2,8 @@
 
 use std::path::Path;
 
-use super::sparse_model::SparseModel;
-use super::{CaptureError, CaptureWarning, colmap};
-
-/// A model and what is odd about it, or why there is none.
-type ReadModel = Result<(SparseModel, Vec<CaptureWarning>), CaptureError>;
-
-/// A way to store cameras, images and points.
-pub(super) struct CaptureFormat {
-    /// Whether the folder holds a capture in it, as far as names of files tell.
-    pub is_in: fn(&Path) -> bool,
-    /// Reads and checks the cameras, images and points of the folder.
-    pub read: fn(&Path) -> ReadModel,
-}
+use super::colmap;
+use super::format::{CaptureFormat, ReadModel};
 
 /// Every format; the first that fits is read.
 const FORMATS: &[CaptureFormat] = &[colmap::FORMAT];

@@ -11,9 +11,11 @@
 
 mod colmap;
 mod colmap_binary;
+mod colmap_models;
 mod colmap_text;
 mod downscale;
 mod error;
+mod format;
 mod formats;
 mod images;
 #[doc(hidden)]

@@ -4,22 +4,8 @@ use std::fs::File;
 use std::io::Read;
 use std::path::Path;
 
+use super::format::SceneFormat;
 use super::{SceneFileError, SplatData, ply};
-
-/// A format of scene files.
-pub struct SceneFormat {
-    /// What people call it.
-    pub name: &'static str,
-    /// Endings of its files, without the dot, in lower case.
-    pub endings: &'static [&'static str],
-    /// Whether a file begins as one in this format does, given its first 64 bytes or all of a
-    /// shorter one.
-    pub is: fn(&[u8]) -> bool,
-    /// Reads a file.
-    pub read: fn(&Path) -> Result<SplatData, SceneFileError>,
-    /// Writes a file, whole or not at all.
-    pub write: fn(&Path, &SplatData) -> Result<(), SceneFileError>,
-}
 
 /// Every format.
 pub const FORMATS: &[SceneFormat] = &[ply::FORMAT];

@@ -6,10 +6,12 @@
 pub mod ply;
 
 mod error;
+mod format;
 mod formats;
 
 pub use error::SceneFileError;
-pub use formats::{FORMATS, SceneFormat, read, write};
+pub use format::SceneFormat;
+pub use formats::{FORMATS, read, write};
 
 use crate::SceneScale;
 

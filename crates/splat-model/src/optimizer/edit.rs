@@ -3,7 +3,7 @@
 use burn::optim::{Adam, AdamState, AdamW, AdamWState, AdaptiveMomentumState, Optimizer};
 use burn::tensor::{Bool, Int, Tensor};
 
-use super::field_optimizer::StateRecord;
+use super::state_record::StateRecord;
 
 /// What an edit of rows does to a moment.
 #[derive(Debug, Clone)]

@@ -8,11 +8,13 @@
 mod adam;
 mod edit;
 mod field_optimizer;
+mod state_record;
 #[cfg(all(test, feature = "cpu"))]
 mod tests;
 mod through_host;
 
 pub use adam::{SplatAdam, SplatAdamState};
 pub use edit::{MomentEdit, RowOptimizer};
-pub use field_optimizer::{FieldOptimizer, StateRecord};
+pub use field_optimizer::FieldOptimizer;
+pub use state_record::StateRecord;
 pub use through_host::ThroughHost;

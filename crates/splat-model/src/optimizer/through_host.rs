@@ -4,7 +4,7 @@ use burn::optim::{LearningRate, Optimizer, RecordState, StateSink, StateSource};
 use burn::tensor::{Device, Tensor, TensorData};
 
 use super::edit::{MomentEdit, RowOptimizer};
-use super::field_optimizer::StateRecord;
+use super::state_record::StateRecord;
 
 /// Makes a [`RowOptimizer`] of any Burn optimiser: on an edit its state is read back, and every
 /// tensor with one row per row of the parameter is edited and sent to the device again. That is

@@ -22,6 +22,7 @@ pub(crate) mod buffer;
 mod instructions;
 mod intersect;
 mod math;
+mod overwritten;
 mod photometric;
 #[cfg(test)]
 pub(crate) mod poison;

@@ -18,9 +18,11 @@ mod batch;
 mod blend;
 mod gradient;
 mod inputs;
+mod lanes;
 mod pixels;
 mod rows;
 mod splat;
+mod tally;
 mod trace;
 mod view;
 mod work;
@@ -41,9 +43,9 @@ use crate::backend::{
     RasterizeTensors,
 };
 use crate::settings::RasterizeArgs;
-use gradient::MOMENTS;
 use inputs::Camera;
 use rows::{GradientRows, RowOfTilesBackward, blend};
+use splat::MOMENTS;
 pub use view::State;
 use view::{Listed, View};
 pub use work::{RasterizeWork, rasterize_work};

@@ -11,7 +11,7 @@ use splat_core::exp::{
     EXP, EXP_LN2_HIGH, EXP_LN2_LOW, EXP2_NEG as EXP2, ROUND_TO_INTEGER as ROUND,
 };
 
-use super::buffer::Overwritten;
+use super::overwritten::Overwritten;
 
 /// f32 or f64. Only what the ops need; every method is inlined so that loops over lanes vectorise.
 pub(crate) trait Real:

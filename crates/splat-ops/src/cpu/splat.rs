@@ -1,6 +1,6 @@
 //! A splat as the inner loops want it: its ellipse, and what its alpha at a pixel takes.
 
-use super::buffer::Overwritten;
+use super::overwritten::Overwritten;
 use super::real::Real;
 
 /// The inverse Cholesky factor times this, squared, counts in powers of two: `2^-|z|^2 =

@@ -5,7 +5,7 @@
 use core::mem::MaybeUninit;
 use core::sync::atomic::{AtomicUsize, Ordering::Relaxed};
 
-use super::buffer::Overwritten;
+use super::overwritten::Overwritten;
 
 /// Memory whose parts are not cleared yet.
 pub(super) struct Uncleared<T> {

@@ -12,11 +12,13 @@ const TERMS: usize = 4;
 /// The terms of a point, and its bytes.
 type Row = ([f64; TERMS], f64);
 
-pub(super) fn gaussians(point: &Point) -> f64 {
+/// Gaussians of a point.
+pub fn gaussians(point: &Point) -> f64 {
     point.work.gaussians as f64
 }
 
-pub(super) fn pixels(point: &Point) -> f64 {
+/// Pixels of a photo of a point.
+pub fn pixels(point: &Point) -> f64 {
     point.work.pixels
 }
 

@@ -3,7 +3,6 @@
 //! Every point is measured in a process of its own, so that its peak memory is its own.
 
 mod fit;
-mod plot;
 mod scene;
 
 use std::fmt::Write;
@@ -13,7 +12,7 @@ use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
 use splat_ops::device::device_info;
 
-pub use fit::{MemoryFit, steepest};
+pub use fit::{MemoryFit, gaussians, pixels, steepest};
 pub use scene::{PhotoSize, synthetic_capture};
 
 use super::device_step::{self, write_device};
@@ -141,14 +140,6 @@ impl ScalingReport {
             memory: MemoryFit::of(&points),
             points,
         })
-    }
-
-    /// The curves of step time and memory, as SVG.
-    ///
-    /// # Errors
-    /// What the drawing library says.
-    pub fn svg(&self) -> Result<String, String> {
-        plot::svg(&self.points)
     }
 
     /// The tables.

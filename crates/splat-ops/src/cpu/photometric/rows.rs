@@ -3,9 +3,13 @@
 
 use core::ops::Range;
 
-use super::sweep::{FIELDS, MOMENTS};
 use crate::cpu::real::Real;
 use crate::cpu::simd::vectorized;
+
+/// mx, my, q, p.
+pub(super) const MOMENTS: usize = 4;
+/// Derivatives by mx, q, p, all but the second halved.
+pub(super) const FIELDS: usize = 3;
 
 /// Values that are summed at once along a row.
 const LANES: usize = 16;

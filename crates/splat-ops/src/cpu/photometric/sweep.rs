@@ -17,7 +17,7 @@
 use core::ops::Range;
 
 use super::pictures::{Pictures, Rows};
-use super::rows;
+use super::rows::{self, FIELDS, MOMENTS};
 use crate::cpu::buffer::overwritten;
 use crate::cpu::real::Real;
 use crate::settings::SsimArgs;
@@ -25,11 +25,6 @@ use crate::ssim::counted;
 
 /// Most pixels of a strip: its rings stay in a core's second-level cache.
 const STRIP: usize = 320;
-/// mx, my, q, p.
-pub(super) const MOMENTS: usize = 4;
-/// Derivatives by mx, q, p, all but the second halved.
-pub(super) const FIELDS: usize = 3;
-
 /// Inputs and settings that all bands share.
 pub(super) struct Sweep<'a, T> {
     rows: Rows<'a, T>,

@@ -5,12 +5,8 @@ use core::ops::Range;
 
 use super::super::real::Real;
 use super::super::simd::prefetch;
-use super::splat::{BLOCKS, GROUP, Splat};
+use super::splat::{BATCH, BLOCKS, GROUP, Splat};
 use super::view::View;
-
-/// How many: so many that what is kept of each fits the first-level cache, and few enough for eight
-/// bits.
-pub(super) const BATCH: usize = 128;
 
 /// Calls a method for some channels, a few at a time and of a number that the compiler knows, which
 /// unrolls its loops: `method::<S, COUNT>(first, ...)`.

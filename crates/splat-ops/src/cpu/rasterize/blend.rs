@@ -11,15 +11,15 @@ use macerator::Simd;
 
 use super::super::real::Real;
 use super::super::tiles::TILE;
-use super::batch::{BATCH, Batch, by_groups};
+use super::batch::{Batch, by_groups};
 use super::pixels::{Pixels, load_each};
 use super::splat::{
-    ACROSS, Aligned, BLOCKS, Centres, GROUP, LANES, Lanes, SIDE, Thresholds, corner, in_blocks,
-    row_of, square,
+    ACROSS, Aligned, BATCH, BLOCKS, Centres, GROUP, LANES, Lanes, SIDE, Thresholds, corner,
+    in_blocks, row_of, square,
 };
+use super::tally::Tally;
 use super::trace::{ByBlock, Trace};
 use super::view::View;
-use super::work::Tally;
 
 /// The pixels of a tile while it is being blended, by block.
 pub(super) struct BlendTile<T> {

@@ -27,17 +27,14 @@ use macerator::{Simd, Vector};
 use super::super::real::Real;
 use super::super::simd::prefetch;
 use super::super::tiles::TILE;
-use super::batch::{BATCH, Batch, ByPlace, by_groups};
+use super::batch::{Batch, ByPlace, by_groups};
 use super::pixels::{Columns, Pixels, four_totals, load_each, total};
 use super::splat::{
-    ACROSS, Aligned, BLOCKS, Centres, GROUP, LANES, Lanes, SIDE, Thresholds, corner, in_blocks,
-    row_mut, row_of, square,
+    ACROSS, Aligned, BATCH, BLOCKS, Centres, GROUP, LANES, Lanes, MOMENTS, SIDE, Thresholds,
+    corner, in_blocks, row_mut, row_of, square,
 };
 use super::trace::{ByBlock, TileTrace};
 use super::view::View;
-
-/// Sums per splat before those of its D colours.
-pub(super) const MOMENTS: usize = 6;
 
 /// The pixels of a tile while they are walked back to front, by block.
 pub(super) struct GradientTile<S: Simd, T: Real> {

@@ -7,7 +7,7 @@
 use macerator::{Mask, Simd, Vector};
 
 use super::super::real::Real;
-use super::splat::{Aligned, LANES, Lanes, SIDE};
+use super::lanes::{Aligned, LANES, Lanes, SIDE};
 
 /// Computes a value for every register that is used.
 // No closure: the compiler must put every function between the instructions and the one that is

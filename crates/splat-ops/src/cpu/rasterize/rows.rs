@@ -10,8 +10,8 @@ use super::super::schedule::heaviest_first;
 use super::super::uninit::Part;
 use super::batch::by_groups;
 use super::blend::BlendTile;
-use super::gradient::{GradientTile, MOMENTS};
-use super::splat::GROUP;
+use super::gradient::GradientTile;
+use super::splat::{GROUP, MOMENTS};
 use super::trace::Trace;
 use super::view::{Frame, Listed, View};
 use crate::backend::PROJECTED_WIDTH;
@@ -179,8 +179,8 @@ mod tests {
     use rand::{RngExt, SeedableRng};
 
     use super::super::super::tiles::TILE;
-    use super::super::batch;
     use super::super::inputs::Camera;
+    use super::super::splat::BATCH;
     use super::*;
     use crate::{ErrorSlot, ImageSize};
 
@@ -269,7 +269,7 @@ mod tests {
         };
         let listed = Listed::new(&camera, &args).unwrap();
         let view = View::new(&listed, camera.background, &args);
-        assert!(view.lists.tile(0).len() > batch::BATCH);
+        assert!(view.lists.tile(0).len() > BATCH);
 
         let both = |chosen| Both {
             view: &view,

@@ -6,31 +6,22 @@ use super::super::real::Real;
 use super::super::splat::UNIT;
 pub(super) use super::super::splat::{GROUP, Splat};
 use super::super::tiles::TILE;
-use super::gradient::MOMENTS;
+pub(super) use super::lanes::{Aligned, LANES, Lanes, SIDE};
 use super::pixels::{Columns, Pixels};
 use crate::settings::RasterizeArgs;
 
-/// Side of a block, the pixels that are worked on at once: as long as it is wide, since then fewest
-/// pixels are tested that a splat does not reach, whatever way it lies.
-pub(super) const SIDE: usize = 4;
+/// How many: so many that what is kept of each fits the first-level cache, and few enough for eight
+/// bits.
+pub(super) const BATCH: usize = 128;
 
-/// Pixels of a block, row by row.
-pub(super) const LANES: usize = SIDE * SIDE;
+/// Sums per splat before those of its D colours.
+pub(super) const MOMENTS: usize = 6;
 
 /// Blocks in each row and each column of a tile.
 pub(super) const ACROSS: usize = TILE / SIDE;
 
 /// Blocks of a tile, row by row. As many as there are bits in [`Splat::blocks`].
 pub(super) const BLOCKS: usize = ACROSS * ACROSS;
-
-/// One value per pixel of a block.
-pub(super) type Lanes<T> = [T; LANES];
-
-/// As wide registers want it in memory: what lies across two lines of the cache is read and written
-/// twice as slowly.
-#[derive(Debug, Clone, Copy)]
-#[repr(align(64))]
-pub(super) struct Aligned<V>(pub(super) V);
 
 impl<T: Real> Splat<T> {
     /// The blocks of the tile that the ellipse reaches, a bit for each: in each row of blocks those

@@ -3,8 +3,7 @@
 use core::ops::Range;
 
 use super::super::tiles::TILE;
-use super::batch::BATCH;
-use super::splat::{Aligned, BLOCKS, Lanes};
+use super::splat::{Aligned, BATCH, BLOCKS, Lanes};
 
 /// One value per pixel of a tile, by block.
 pub(super) type ByBlock<T> = [Aligned<Lanes<T>>; BLOCKS];

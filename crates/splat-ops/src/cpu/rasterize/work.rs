@@ -7,6 +7,7 @@ use rayon::prelude::*;
 use super::blend::BlendTile;
 use super::inputs::Camera;
 use super::splat::LANES;
+use super::tally::Tally;
 use super::trace::Trace;
 use super::view::{Listed, View};
 use crate::backend::PROJECTED_WIDTH;
@@ -107,23 +108,6 @@ impl RasterizeWork {
         self.seen += other.seen;
         self.blended += other.blended;
     }
-}
-
-/// Told about the pixels of every (block, splat) pair.
-pub(super) trait Tally {
-    /// Alphas were evaluated; asks which of them are seen.
-    fn tested(&mut self, seen: impl FnOnce() -> [bool; LANES]);
-    /// Alphas may have been blended; asks which of them were.
-    fn blended(&mut self, blended: impl FnOnce() -> [bool; LANES]);
-}
-
-/// Nobody counts, and it costs nothing.
-impl Tally for () {
-    #[inline(always)]
-    fn tested(&mut self, _: impl FnOnce() -> [bool; LANES]) {}
-
-    #[inline(always)]
-    fn blended(&mut self, _: impl FnOnce() -> [bool; LANES]) {}
 }
 
 impl Tally for RasterizeWork {

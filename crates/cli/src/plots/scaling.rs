@@ -5,8 +5,7 @@ use std::ops::Range;
 use plotters::coord::Shift;
 use plotters::prelude::*;
 
-use super::Point;
-use super::fit::{gaussians, pixels};
+use splat_lab::performance::scaling::{Point, gaussians, pixels};
 
 /// Size of one panel in pixels.
 const PANEL: (u32, u32) = (440, 400);
@@ -63,7 +62,7 @@ fn megapixels(point: &Point) -> f64 {
     (point.work.pixels / 1e5).round() / 10.0
 }
 
-pub(super) fn svg(points: &[Point]) -> Result<String, String> {
+pub(crate) fn svg(points: &[Point]) -> Result<String, String> {
     let mut svg = String::new();
     {
         let size = (PANEL.0 * PANELS.len() as u32, PANEL.1);

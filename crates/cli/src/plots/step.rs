@@ -5,7 +5,7 @@ use plotters::element::Rectangle;
 use plotters::prelude::*;
 use plotters::style::text_anchor::{HPos, Pos, VPos};
 
-use super::step::StepRow;
+use splat_lab::performance::step::StepRow;
 
 /// Width of the picture, and height of a bar with its gap, in pixels.
 const WIDTH: u32 = 900;
@@ -21,7 +21,7 @@ const NAMES: u32 = 150;
 
 type DrawError<'a> = DrawingAreaErrorKind<<SVGBackend<'a> as DrawingBackend>::ErrorType>;
 
-pub(super) fn svg(rows: &[StepRow]) -> Result<String, String> {
+pub(crate) fn svg(rows: &[StepRow]) -> Result<String, String> {
     let mut names: Vec<&str> = vec![];
     for (name, _) in rows.iter().flat_map(|row| &row.stages) {
         if !names.contains(&name.as_str()) {
