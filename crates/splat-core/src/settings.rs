@@ -41,6 +41,48 @@ impl Default for ProjectSettings {
     }
 }
 
+impl ProjectSettings {
+    /// The defaults; `with_*` methods change them one by one.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// The same with another `near`.
+    #[must_use]
+    pub fn with_near(mut self, near: f64) -> Self {
+        self.near = near;
+        self
+    }
+
+    /// The same with another `far`.
+    #[must_use]
+    pub fn with_far(mut self, far: f64) -> Self {
+        self.far = far;
+        self
+    }
+
+    /// The same with another `eps2d`.
+    #[must_use]
+    pub fn with_eps2d(mut self, eps2d: f64) -> Self {
+        self.eps2d = eps2d;
+        self
+    }
+
+    /// The same with another `clamp_margin`.
+    #[must_use]
+    pub fn with_clamp_margin(mut self, clamp_margin: f64) -> Self {
+        self.clamp_margin = clamp_margin;
+        self
+    }
+
+    /// The same with another `alpha_min`.
+    #[must_use]
+    pub fn with_alpha_min(mut self, alpha_min: f64) -> Self {
+        self.alpha_min = alpha_min;
+        self
+    }
+}
+
 /// Settings of `rasterize`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RasterizeSettings {
@@ -74,6 +116,41 @@ impl Default for RasterizeSettings {
     }
 }
 
+impl RasterizeSettings {
+    /// The defaults; `with_*` methods change them one by one.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// The same with another `alpha_min`.
+    #[must_use]
+    pub fn with_alpha_min(mut self, alpha_min: f64) -> Self {
+        self.alpha_min = alpha_min;
+        self
+    }
+
+    /// The same with another `alpha_max`.
+    #[must_use]
+    pub fn with_alpha_max(mut self, alpha_max: f64) -> Self {
+        self.alpha_max = alpha_max;
+        self
+    }
+
+    /// The same with another `transmittance_min`.
+    #[must_use]
+    pub fn with_transmittance_min(mut self, transmittance_min: f64) -> Self {
+        self.transmittance_min = transmittance_min;
+        self
+    }
+
+    /// The same with another `deterministic`.
+    #[must_use]
+    pub fn with_deterministic(mut self, deterministic: bool) -> Self {
+        self.deterministic = deterministic;
+        self
+    }
+}
+
 /// Gradient of the clamp of colours at zero, `max(x, 0)`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum ClampGradient {
@@ -93,6 +170,27 @@ pub struct ShColorSettings {
     pub degree: usize,
     /// Gradient of the clamp at zero. Default exact.
     pub clamp_gradient: ClampGradient,
+}
+
+impl ShColorSettings {
+    /// The defaults; `with_*` methods change them one by one.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// The same with another `degree`.
+    #[must_use]
+    pub fn with_degree(mut self, degree: usize) -> Self {
+        self.degree = degree;
+        self
+    }
+
+    /// The same with another `clamp_gradient`.
+    #[must_use]
+    pub fn with_clamp_gradient(mut self, clamp_gradient: ClampGradient) -> Self {
+        self.clamp_gradient = clamp_gradient;
+        self
+    }
 }
 
 impl From<usize> for ShColorSettings {

@@ -33,6 +33,7 @@ struct Scene {
 impl Scene {
     /// Results of every op and all gradients, as bits. Splats lie in the left part of the image,
     /// some behind the cameras and some too faint to be seen.
+    // Longer than a hundred lines: a call of every op, one after the other.
     fn run(&self, device: &Device) -> Vec<(&'static str, Vec<u32>)> {
         let (c, n, d) = (self.cameras, self.gaussians, self.channels);
         let device = device.clone().autodiff();
