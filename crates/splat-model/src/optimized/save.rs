@@ -30,10 +30,11 @@ impl<M: Module> Optimized<M> {
         for (name, value) in fixed {
             record.tensors.insert(name, value.into_data());
         }
+        let shapes = self.shapes();
         for field in &self.fields {
             let name = &field.name;
             let [values] = self.read([name.as_str()])?;
-            let width = self.shapes()[name][1];
+            let [_, width] = shapes[name];
             let rows = values.len() / width.max(1);
             record
                 .tensors
@@ -42,19 +43,7 @@ impl<M: Module> Optimized<M> {
             if let Some(waiting) = self.waiting.get(name) {
                 state.tensors.insert(WAITING.to_owned(), waiting.to_data());
             }
-            let of = |leaf: String| format!("{name}.{leaf}");
-            record.tensors.extend(
-                state
-                    .tensors
-                    .into_iter()
-                    .map(|(leaf, data)| (of(leaf), data)),
-            );
-            record.scalars.extend(
-                state
-                    .scalars
-                    .into_iter()
-                    .map(|(leaf, value)| (of(leaf), value)),
-            );
+            record.put_under(name, state);
         }
         Ok(record)
     }
