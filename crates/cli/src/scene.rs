@@ -15,8 +15,8 @@ pub enum PrecisionChoice {
     /// Single precision
     #[default]
     Exact,
-    /// The higher degrees in half precision, on devices that read it: less memory; docs/GPU.md has
-    /// the error
+    /// The higher degrees in half precision, on devices that support it: less memory;
+    /// docs/notes/half-precision.md has the error
     Half,
 }
 

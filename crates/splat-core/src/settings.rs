@@ -96,12 +96,13 @@ pub struct RasterizeSettings {
     /// 9.999e-5: the 1e-4 of 3DGS appendix C less one part in 10,000, because two splats at the cap
     /// leave exactly 1e-4, which rounds to either side.
     pub transmittance_min: f64,
-    /// Whether the same input gives the same gradients, bit for bit, every time. Default true.
-    /// False, on a CubeCL device: the tiles' shares of a splat's gradient are added up as they
-    /// come, which differs from run to run in the last digits. It saves memory, 24 bytes and 4 per
-    /// channel of each intersection in the backward pass, and from the forward pass on 4 of each
-    /// and 12 of each Gaussian and camera; docs/GPU.md has what it does to the time. The CPU sums
-    /// in order in any case.
+    /// Makes gradients reproducible bit for bit. Default true.
+    ///
+    /// When false, a CubeCL device sums the tiles' shares of a splat's gradient by atomic
+    /// addition, which differs between runs in the last digits. That saves memory: per
+    /// intersection 24 bytes and 4 per channel in the backward pass and 4 bytes from the forward
+    /// pass on, and 12 bytes per Gaussian and camera. `docs/notes/rasteriser-gradient.md` compares
+    /// the times. The CPU always sums in order.
     pub deterministic: bool,
 }
 

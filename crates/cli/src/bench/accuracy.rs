@@ -95,15 +95,15 @@ fn page(report: &Report, backends: &[Backend]) -> String {
          Written by `cargo run --release -- bench accuracy --report docs`.\n\n\
          Machine: {}. Backends: {}. Double precision on the CPU is the reference; it is itself held to PyTorch float64 \
          within a relative L2 error of 1e-9 on every fixture (`cargo test --release --test gradients`).\n\n\
-         The tier that everything here is measured in, and the only one of training, is exact: full single \
-         precision, the exponential by a polynomial of degree 5 (relative error below 2e-7, fused or not). A polynomial of degree 3 (1e-4) was measured and left out: forward and backward \
-         together gained 0 to 2 % on 50,000 splats, and on 15,000 from 6 % less to 3 % more time. Coefficients in \
-         half precision (f16, read eight at a time by the processor's own conversion, sums in f32) were measured and left \
-         out on the CPU: error 2.1e-4, and the colours of 1,000,000 splats at degree 3 took 31 ms instead of 19, those of \
-         100,000 at least 2.8 ms instead of 1.4: the conversion costs more than the memory saves. Reading the colours is \
-         too little to gain from (once per splat and view). CubeCL devices can render from such coefficients by name \
-         (`--sh-precision half`): the colours of random ones are within a relative L2 error of 1e-4 of double precision \
-         (a test), `docs/GPU.md` has what a trained scene loses and how many bytes it saves.\n\n\
+         Everything is measured in full single precision, which training always uses; the exponential is a polynomial of \
+         degree 5 (relative error below 2e-7, fused or not). Two cheaper variants were measured and dropped. \
+         A polynomial of degree 3 (1e-4) made forward and backward together 0 to 2 % faster on 50,000 splats, and between \
+         6 % faster and 3 % slower on 15,000. SH coefficients in half precision (f16, converted eight at a time by the \
+         processor, sums in f32) have an error of 2.1e-4 on the CPU and are slower: the colours of 1,000,000 splats at \
+         degree 3 took 31 ms instead of 19, those of 100,000 at least 2.8 ms instead of 1.4. CubeCL devices can render \
+         from such coefficients (`--sh-precision half`): a test holds the colours of random ones within a relative L2 \
+         error of 1e-4 of double precision, and `docs/notes/half-precision.md` has the error on a trained scene and the \
+         bytes saved.\n\n\
          ![error against time](accuracy.svg)\n\n{}",
         report.machine,
         names.join(", "),

@@ -25,7 +25,7 @@ impl PerformanceReport {
         let bench = "cargo run --release -- bench";
         format!(
             "# Performance on the CPU\n\n\
-             What needs a GPU to be measured is in [GPU.md](GPU.md), each with its command.\n\n\
+             [GPU.md](GPU.md) lists the measurements that need a GPU.\n\n\
              Written by `{bench} performance{all}`. Everything in single precision, exact.\n\n\
              Machine: {}\n\n\
              ## Training step\n\n`{bench} step{step}`. {}\n\
