@@ -4,6 +4,18 @@ use glam::{DMat4, DVec3};
 use splat_core::ImageSize;
 
 /// A pinhole camera: axes +x right, +y down, +z forward (OpenCV, COLMAP).
+///
+/// ```
+/// use glam::{DMat4, DVec3};
+/// use splat_data::{Camera, ImageSize};
+///
+/// let camera = Camera {
+///     viewmat: DMat4::from_translation(DVec3::new(0.0, 0.0, 2.0)),
+///     intrinsics: [50.0, 50.0, 32.0, 24.0],
+///     size: ImageSize { width: 64, height: 48 },
+/// };
+/// assert_eq!(camera.position(), DVec3::new(0.0, 0.0, -2.0));
+/// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Camera {
     /// World to camera.

@@ -4,7 +4,23 @@ use burn::tensor::{Device, Tensor, TensorData};
 use splat_data::Camera;
 use splat_ops::ImageSize;
 
-/// C cameras of one image size, as tensors: give them `require_grad` to refine poses or intrinsics.
+/// C cameras of one image size, as tensors. Call `require_grad` on them to refine poses or
+/// intrinsics.
+///
+/// ```
+/// use burn::tensor::Device;
+/// use splat_model::{Camera, CameraTensors};
+///
+/// let camera = Camera {
+///     viewmat: glam::DMat4::IDENTITY,
+///     intrinsics: [50.0, 50.0, 32.0, 24.0],
+///     size: splat_model::ops::ImageSize { width: 64, height: 48 },
+/// };
+/// let mut cameras = CameraTensors::from_camera(&camera, &Device::flex().autodiff());
+/// cameras.viewmats = cameras.viewmats.require_grad();
+/// let gradients = cameras.centers().sum().backward();
+/// assert!(cameras.viewmats.grad(&gradients).is_some());
+/// ```
 #[derive(Debug, Clone)]
 pub struct CameraTensors {
     /// World to camera, `[C, 4, 4]`.

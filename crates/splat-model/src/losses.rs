@@ -1,4 +1,14 @@
 //! Image losses and metrics, as functions on tensors of images `[B, H, W, D]`.
+//!
+//! ```
+//! use burn::tensor::{Device, Tensor};
+//! use splat_model::losses::psnr;
+//!
+//! let device = Device::flex();
+//! let image = Tensor::<4>::full([1, 16, 16, 3], 0.5, &device);
+//! let target = Tensor::<4>::full([1, 16, 16, 3], 0.6, &device);
+//! assert!((psnr(image, target).into_scalar::<f32>() - 20.0).abs() < 1e-3);
+//! ```
 
 use burn::tensor::Tensor;
 use derive_setters::Setters;

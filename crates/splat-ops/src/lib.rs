@@ -5,14 +5,68 @@
 //! SH coefficients, means, camera centres ──> sh_colors ──> colours ─┴─> rasterize ──> Rendered
 //! ```
 //!
-//! The ops are separate so that anything can be put between them: another colour model, another
-//! opacity, another projection. Each has a hand-written gradient, registered with Burn's autodiff,
-//! and two implementations behind one trait ([`backend::SplatBackend`]): CubeCL kernels for every
-//! CubeCL device (feature `wgpu`, `vulkan`, `cuda`) and native Rust for Burn's Flex backend
-//! (feature `cpu`; f32, and f64 as the reference).
+//! | op | computes | differentiable in |
+//! |---|---|---|
+//! | [`project()`] | screen splats, as [`Projected`] | means, quats, scales, viewmats, intrinsics |
+//! | [`sh_colors()`] | clamped view-dependent colours | coefficients, means, camera centres |
+//! | [`spherical_harmonics()`] | the plain sum of spherical harmonics | coefficients, directions |
+//! | [`rasterize()`] | image and alpha, as [`Rendered`] | splats, colours, opacities, background |
+//! | [`photometric()`] | L1 and mean SSIM, as [`Photometric`] | the rendered image |
+//! | [`photometric_masked`] | the same over the pixels that a mask keeps | the rendered image |
+//! | [`ssim_map`] | SSIM per pixel and channel | both images |
+//! | [`gaussian_blur`] | a separable symmetric window | the image |
+//! | [`exp`], [`sigmoid`] | activations of scales and opacities | the input |
+//! | [`adam_step`] | one step of Adam on one parameter | - |
+//! | [`ScreenStatistics`] | sums for density control | - |
 //!
-//! Every op and every gradient runs in a `tracing` span of its name, level trace, on the caller's
-//! thread: one load and a branch where nobody listens.
+//! ```
+//! use burn::tensor::{Device, Tensor};
+//! use splat_ops::{
+//!     ImageSize, ProjectSettings, RasterizeSettings, ScreenStatistics, project, rasterize, sh_colors,
+//! };
+//!
+//! let device = Device::flex().autodiff();
+//! let means = [[0.0, 0.0, 4.0], [0.5, 0.0, 6.0]];
+//! let means = Tensor::<2>::from_floats(means, &device).require_grad();
+//! let intrinsics = [[50.0, 50.0, 32.0, 24.0]];
+//! let intrinsics = Tensor::<2>::from_floats(intrinsics, &device).require_grad();
+//! let projected = project(
+//!     means.clone(),
+//!     Tensor::from_floats([[1.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]], &device), // quats
+//!     splat_ops::exp(Tensor::full([2, 3], -2.0, &device)),                        // scales
+//!     Tensor::<2>::eye(4, &device).unsqueeze(),                                   // viewmats
+//!     intrinsics.clone(),
+//!     ImageSize { width: 64, height: 48 },
+//!     &ProjectSettings::default(),
+//! )?;
+//! let (projected, probe) = projected.with_screen_probe();
+//! let (sh0, centers) = (Tensor::zeros([2, 1, 3], &device), Tensor::zeros([1, 3], &device));
+//! let colors = sh_colors(sh0, None, means.clone(), centers, 0, Some(&projected))?;
+//! let opacities = splat_ops::sigmoid(Tensor::<1>::zeros([2], &device));
+//! let rendered = rasterize(&projected, colors, opacities, None, &RasterizeSettings::default())?;
+//!
+//! // Gradients of the Gaussians and of the camera.
+//! let gradients = rendered.image().mean().backward();
+//! assert!(means.grad(&gradients).is_some());
+//! assert!(intrinsics.grad(&gradients).is_some());
+//!
+//! // Statistics of the screen means, for density control.
+//! let gradient = probe.grad(&gradients).unwrap();
+//! let zeros = || Tensor::<1>::zeros([2], &gradient.device());
+//! let sums = ScreenStatistics { gradients: zeros(), views: zeros() };
+//! let sums = sums.add(gradient, &projected)?;
+//! assert_eq!(sums.views.into_data().try_into_vec::<f32>().unwrap(), [1.0, 1.0]);
+//! # Ok::<(), splat_ops::OpError>(())
+//! ```
+//!
+//! The ops are separate so that anything can go between them: another colour model, another
+//! opacity, another projection. Gradients are registered with Burn's autodiff and computed only for
+//! inputs that it tracks. Each op has two implementations behind one trait
+//! ([`backend::SplatBackend`]): CubeCL kernels for every CubeCL device (features `wgpu`, `vulkan`,
+//! `cuda`), and native Rust for Burn's Flex backend (feature `cpu`; f32, and f64 as the reference).
+//!
+//! Every op and every gradient runs in a `tracing` span of its name, at level trace, on the
+//! caller's thread. Without a subscriber, a span costs one load and one branch.
 //!
 //! # Conventions
 //! - World and camera are right-handed; camera axes are +x right, +y down, +z forward (OpenCV,

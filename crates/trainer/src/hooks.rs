@@ -29,9 +29,33 @@ pub struct HookView<'a> {
     pub purpose: Purpose,
 }
 
-/// Something that is trained beside the model: poses, exposures, a background. Every method has a
-/// default that changes nothing. Given to [`TrainerBuilder::hook`](crate::TrainerBuilder::hook);
-/// asked in the order in which hooks were given.
+/// A module trained beside the model: poses, exposures, a background. Every method has a default
+/// that changes nothing. [`TrainerBuilder::hook`](crate::TrainerBuilder::hook) adds one; hooks are
+/// asked in the order in which they were added.
+///
+/// ```
+/// use burn::tensor::Tensor;
+/// use splat_model::CameraTensors;
+/// use splat_model::ops::OpError;
+/// use splat_trainer::{Hook, HookView};
+///
+/// /// White behind every view.
+/// struct White;
+///
+/// impl Hook for White {
+///     fn name(&self) -> &str {
+///         "white"
+///     }
+///     fn background(
+///         &self,
+///         _: &HookView,
+///         cameras: &CameraTensors,
+///     ) -> Result<Option<Tensor<2>>, OpError> {
+///         let [count, _, _] = cameras.viewmats.dims();
+///         Ok(Some(Tensor::ones([count, 3], &cameras.viewmats.device())))
+///     }
+/// }
+/// ```
 pub trait Hook: Any + Send {
     /// What a checkpoint calls it; no two hooks of a run share a name.
     fn name(&self) -> &str;

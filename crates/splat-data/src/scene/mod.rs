@@ -1,7 +1,25 @@
-//! Scene files: trained splats in and out, as plain data ([`SplatData`]) that knows no tensor.
+//! Scene files: trained splats as plain data ([`SplatData`]), without tensors.
 //!
-//! [`read()`] and [`write()`] know the format by the file. Today there is one: [`ply`], the layout
-//! of the 3DGS paper's code, which every viewer reads.
+//! [`read()`] and [`write()`] recognise the format by the file. Today there is one: [`ply`], the
+//! layout of the 3DGS paper's code, which every viewer reads.
+//!
+//! ```
+//! use splat_data::{SplatData, scene};
+//!
+//! let splats = SplatData {
+//!     means: vec![[0.0, 0.0, 4.0]],
+//!     log_scales: vec![[-2.0; 3]],
+//!     quats: vec![[1.0, 0.0, 0.0, 0.0]],
+//!     opacity_logits: vec![0.0],
+//!     sh0: vec![[0.5; 3]],
+//!     ..SplatData::default()
+//! };
+//! # let folder = tempfile::tempdir()?;
+//! let path = folder.path().join("scene.ply");
+//! scene::write(&path, &splats)?;
+//! assert_eq!(scene::read(&path)?.means, splats.means);
+//! # Ok::<(), Box<dyn std::error::Error>>(())
+//! ```
 
 pub mod ply;
 

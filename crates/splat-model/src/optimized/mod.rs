@@ -33,9 +33,33 @@ pub enum FieldStep {
     Skip,
 }
 
-/// A model, and for each of its fields an optimiser that owns the field's moments.
+/// A model, with an optimiser for each of its fields that owns the field's moments.
 ///
-/// Rows of the model are edited here only, so that moments always belong to the rows beside them.
+/// Rows of the model are edited only here, so that moments always match their rows.
+///
+/// ```
+/// use burn::tensor::Device;
+/// use splat_model::ops::AdamRows;
+/// use splat_model::{FieldStep, Gaussians, LearningRates, Optimized, SceneScale, SplatData};
+///
+/// let splats = SplatData {
+///     means: vec![[0.0; 3]],
+///     log_scales: vec![[0.0; 3]],
+///     quats: vec![[1.0, 0.0, 0.0, 0.0]],
+///     opacity_logits: vec![0.0],
+///     sh0: vec![[0.0; 3]],
+///     ..SplatData::default()
+/// };
+/// let gaussians = Gaussians::from_data(&splats, &Device::flex().autodiff());
+/// let (rates, scale) = (LearningRates::new(), SceneScale::new(1.0).unwrap());
+/// let mut model = Optimized::with_adam(gaussians, &rates, AdamRows::All, scale)?;
+/// let loss = model.model().opacities().sum();
+/// let gradients = model.gradients(&mut loss.backward());
+/// model.step(gradients, |field| (field.rate, FieldStep::Step(1.0)))?;
+/// let [logits] = model.read(["opacity_logits"])?;
+/// assert!((f64::from(logits[0]) + rates.opacities).abs() < 1e-4); // Adam's first step is the rate
+/// # Ok::<(), splat_model::ops::OpError>(())
+/// ```
 #[derive(Debug)]
 pub struct Optimized<M> {
     /// Taken out while it is changed.

@@ -53,7 +53,17 @@ impl<'a> TargetView<'a> {
     }
 }
 
-/// Named, weighted terms; the loss is their weighted sum, and each is logged by its name.
+/// Named, weighted terms. The loss is their weighted sum, and each is logged by name.
+///
+/// ```
+/// use splat_trainer::LossTerms;
+///
+/// let loss = LossTerms::new()
+///     .term("l1", 0.8, |view, rendered| Ok((rendered.image() - view.image()).abs().mean()))
+///     .term("opaque", 0.1, |_, rendered| {
+///         Ok(rendered.alpha().neg().add_scalar(1.0).mean())
+///     });
+/// ```
 #[derive(Default)]
 pub struct LossTerms {
     groups: Vec<Group>,
