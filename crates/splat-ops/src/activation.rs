@@ -1,4 +1,4 @@
-//! The activations of scales and opacities (3DGS section 5.1).
+//! Activations of scales and opacities (3DGS section 5.1).
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
@@ -7,8 +7,10 @@ use tracing::trace_span;
 use crate::backend::ActivationOps;
 use crate::settings::Activation;
 
-/// `exp(x)`, of logarithms of scales for example. The same function as [`Tensor::exp`], to 2 units
-/// in the last place on every device; on the CPU in SIMD and parallel.
+/// `exp(x)`, the activation of log-scales.
+///
+/// Equal to [`Tensor::exp`] within 2 units in the last place on every device. On the CPU it uses
+/// SIMD and all threads.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};
@@ -20,11 +22,11 @@ pub fn exp<const D: usize>(x: Tensor<D>) -> Tensor<D> {
     activate(x, Activation::Exp)
 }
 
-/// The logistic function `1 / (1 + exp(-x))`, of opacity logits for example.
+/// The logistic function `1 / (1 + exp(-x))`, the activation of opacity logits.
 ///
-/// Its gradient is computed from x, as `e / (1 + e)^2` with `e = exp(-|x|)`. Burn's own takes it
-/// from the output, as `o (1 - o)`, which is exactly zero once o rounds to one (from a logit of 17
-/// on in single precision): a Gaussian could never become transparent again.
+/// The gradient is computed from x, as `e / (1 + e)^2` with `e = exp(-|x|)`. Burn's own sigmoid
+/// computes it from the output, as `o (1 - o)`, which is exactly zero once o rounds to one (in
+/// single precision from a logit of 17): a saturated Gaussian could never become transparent again.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};

@@ -1,4 +1,4 @@
-//! One step of Adam (Kingma & Ba 2015) on one parameter: the arithmetic, without any state.
+//! One step of Adam (Kingma & Ba 2015) on one parameter, without state.
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
@@ -9,12 +9,13 @@ use crate::backend::{AdamOps, AdamTensors, OpInputs};
 use crate::check::Checker;
 use crate::settings::AdamStep;
 
-/// Steps a parameter and its two moments, all of one shape: `m = beta_1 m + (1 - beta_1) g`, `v =
-/// beta_2 v + (1 - beta_2) g^2`, `p = p - rate m / (sqrt(v) + epsilon)`. Not differentiable. One
-/// pass over memory, in place where nothing else holds the tensors.
+/// Steps a parameter and its two moments, all of one shape.
 ///
-/// A gradient whose square is not finite counts as zero: one NaN would stay in the moments for
-/// good.
+/// `m = beta_1 m + (1 - beta_1) g`, `v = beta_2 v + (1 - beta_2) g^2`, `p = p - rate m / (sqrt(v) +
+/// epsilon)`. Takes one pass over memory, in place if nothing else holds the tensors. Not
+/// differentiable.
+///
+/// A gradient whose square is not finite counts as zero; a NaN would stay in the moments forever.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};

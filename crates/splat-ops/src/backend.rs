@@ -1,9 +1,8 @@
-//! The traits of a backend: for each op a trait of the op as Burn dispatches it ([`ProjectOps`]),
-//! and for one with a gradient of its own a trait of that ([`ProjectBackend`]). [`SplatBackend`] is
-//! all of them.
+//! Backend traits. Each op has a trait as Burn dispatches it ([`ProjectOps`]); an op with its own
+//! gradient has a second one for that ([`ProjectBackend`]). [`SplatBackend`] combines them all.
 //!
 //! Callers have checked all shapes; tensors need not be contiguous. A gradient function is told
-//! which gradients are needed; the others are `None` and cost nothing.
+//! which gradients are needed and returns `None` for the others.
 
 use core::fmt::Debug;
 
@@ -25,11 +24,11 @@ pub use splat_core::{
     ScreenStatisticsTensors, ShColorTensors, SphericalHarmonicsTensors, SsimTensors,
 };
 
-/// The tensors of one op, in the form in which Burn's dispatch carries them.
+/// Tensors of one op, in the form that Burn's dispatch carries.
 #[derive(Debug, Clone)]
 pub struct OpInputs<X>(pub X);
 
-/// Names the inputs of ops, and takes them through Burn's dispatch.
+/// Names the inputs of ops and passes them through Burn's dispatch.
 macro_rules! inputs {
     ($($(#[$doc:meta])* $name:ident = $tensors:ty;)+) => {$(
         $(#[$doc])*
@@ -101,17 +100,17 @@ pub type RasterizeGradients<B> = RasterizeTensors<Option<FloatTensor<B>>>;
 /// Gradients of [`SsimInputs`].
 pub type SsimGradients<B> = SsimTensors<Option<FloatTensor<B>>>;
 
-/// Photo that [`photometric`](crate::photometric) compares with, `[B, H, W, D]`, in the form in
-/// which Burn's dispatch carries it.
+/// Photo that [`photometric`](crate::photometric) compares with, `[B, H, W, D]`, in the form that
+/// Burn's dispatch carries.
 #[derive(Debug, Clone, ExtensionType)]
 pub enum Target<B: Backend> {
-    /// Levels of any integer type, 0 to 255, for `level / 255`.
+    /// Levels 0 to 255 of any integer type, meaning `level / 255`.
     Levels(IntTensor<B>),
-    /// As they are.
+    /// The values themselves.
     Values(FloatTensor<B>),
 }
 
-/// A parameter and its moments after a step, in the form in which Burn's dispatch carries them.
+/// A parameter and its moments after a step, in the form that Burn's dispatch carries.
 #[derive(Debug, Clone, ExtensionType)]
 pub struct AdamOutputs<B: Backend> {
     /// Parameter.
@@ -122,7 +121,7 @@ pub struct AdamOutputs<B: Backend> {
     pub moment_2: FloatTensor<B>,
 }
 
-/// Sums of screen gradients and of views, in the form in which Burn's dispatch carries them.
+/// Sums of screen gradients and of views, in the form that Burn's dispatch carries.
 #[derive(Debug, Clone, ExtensionType)]
 pub struct ScreenStatisticsOutputs<B: Backend> {
     /// Sums of the lengths of screen gradients `[N]`.
@@ -143,7 +142,7 @@ pub trait ProjectOps: Backend {
 
 /// The gradient of [`ProjectOps`].
 pub trait ProjectBackend: ProjectOps {
-    /// Given the gradient `[C, N, 9]` of the packed splats.
+    /// Gradients of the inputs, from the gradient `[C, N, 9]` of the packed splats.
     fn project_backward(
         inputs: ProjectInputs<Self>,
         grad_packed: FloatTensor<Self>,
@@ -155,7 +154,7 @@ pub trait ProjectBackend: ProjectOps {
 /// [`Projected::with_screen_probe`](crate::Projected::with_screen_probe).
 #[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
 pub trait ScreenProbeOps: Backend {
-    /// The packed splats as they are; their gradient goes to the probe too.
+    /// Returns the packed splats unchanged; their gradient goes to the probe too.
     fn screen_probe(packed: FloatTensor<Self>, _probe: FloatTensor<Self>) -> FloatTensor<Self> {
         packed
     }
@@ -173,7 +172,7 @@ pub trait SphericalHarmonicsOps: Backend {
 
 /// The gradient of [`SphericalHarmonicsOps`].
 pub trait SphericalHarmonicsBackend: SphericalHarmonicsOps {
-    /// Given the gradient `[C, N, 3]` of the colours.
+    /// Gradients of the inputs, from the gradient `[C, N, 3]` of the colours.
     fn spherical_harmonics_backward(
         inputs: SphericalHarmonicsInputs<Self>,
         grad_colors: FloatTensor<Self>,
@@ -185,7 +184,7 @@ pub trait SphericalHarmonicsBackend: SphericalHarmonicsOps {
 /// [`sh_colors`](crate::sh_colors()).
 #[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
 pub trait ShColorsOps: Backend {
-    /// Colours `[C, N, 3]`. There are higher coefficients exactly when the degree is above 0.
+    /// Colours `[C, N, 3]`. Higher coefficients are present exactly when the degree is above 0.
     fn sh_colors(
         #[extension_type] inputs: ShColorInputs<Self>,
         settings: ShColorSettings,
@@ -194,7 +193,7 @@ pub trait ShColorsOps: Backend {
 
 /// The gradient of [`ShColorsOps`].
 pub trait ShColorsBackend: ShColorsOps {
-    /// Given the gradient `[C, N, 3]` of the colours.
+    /// Gradients of the inputs, from the gradient `[C, N, 3]` of the colours.
     fn sh_colors_backward(
         inputs: ShColorInputs<Self>,
         grad_colors: FloatTensor<Self>,
@@ -206,13 +205,13 @@ pub trait ShColorsBackend: ShColorsOps {
 /// [`exp`](crate::exp) and [`sigmoid`](crate::sigmoid).
 #[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
 pub trait ActivationOps: Backend {
-    /// The function of every element.
+    /// Applies the function to every element.
     fn activation(x: FloatTensor<Self>, function: Activation) -> FloatTensor<Self>;
 }
 
 /// The gradient of [`ActivationOps`].
 pub trait ActivationBackend: ActivationOps {
-    /// Gradient of the input x, given x, the output y, and the gradient of y.
+    /// Gradient of the input x, from x, the output y, and the gradient of y.
     fn activation_backward(
         x: FloatTensor<Self>,
         y: FloatTensor<Self>,
@@ -224,10 +223,10 @@ pub trait ActivationBackend: ActivationOps {
 /// [`rasterize`](crate::rasterize()).
 #[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
 pub trait RasterizeOps: Backend {
-    /// `[C, H, W, D + 1]`, the last channel being alpha.
+    /// Image `[C, H, W, D + 1]`; the last channel is alpha.
     ///
-    /// Errors are reported to `args.errors`; the image is then zero, and the gradients that the
-    /// state leads to are.
+    /// Reports errors to `args.errors`. The image is then zero, and so are gradients computed from
+    /// the state.
     fn rasterize(
         #[extension_type] inputs: RasterizeInputs<Self>,
         args: RasterizeArgs,
@@ -236,17 +235,16 @@ pub trait RasterizeOps: Backend {
 
 /// The gradient of [`RasterizeOps`].
 pub trait RasterizeBackend: RasterizeOps {
-    /// Kept from the forward pass for the backward pass: lists of splats per tile, final
-    /// transmittances and the like.
+    /// State kept for the backward pass: lists of splats per tile, final transmittances and so on.
     type RasterizeState: Clone + Debug + Send + 'static;
 
-    /// [`RasterizeOps::rasterize`], and what its gradient needs.
+    /// [`RasterizeOps::rasterize`], with the state that its gradient needs.
     fn rasterize_tracked(
         inputs: RasterizeInputs<Self>,
         args: &RasterizeArgs,
     ) -> (FloatTensor<Self>, Self::RasterizeState);
 
-    /// Given the forward pass's state and the gradient `[C, H, W, D + 1]` of its output.
+    /// Gradients of the inputs, from the state and the gradient `[C, H, W, D + 1]` of the output.
     fn rasterize_backward(
         inputs: RasterizeInputs<Self>,
         state: Self::RasterizeState,
@@ -256,10 +254,11 @@ pub trait RasterizeBackend: RasterizeOps {
     ) -> RasterizeGradients<Self>;
 }
 
-/// [`gaussian_blur`](crate::gaussian_blur); linear and self-adjoint, and so its own gradient.
+/// [`gaussian_blur`](crate::gaussian_blur). Linear and self-adjoint, so it is its own gradient.
 #[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
 pub trait BlurOps: Backend {
-    /// Rows and columns of `[B, H, W, D]` under a symmetric window of odd length, zeros outside.
+    /// Convolves the rows and columns of `[B, H, W, D]` with a symmetric window of odd length; zero
+    /// outside.
     fn gaussian_blur(image: FloatTensor<Self>, window: Vec<f64>) -> FloatTensor<Self>;
 }
 
@@ -272,13 +271,13 @@ pub trait SsimOps: Backend {
 
 /// The gradient of [`SsimOps`].
 pub trait SsimBackend: SsimOps {
-    /// [`SsimOps::ssim`], and the windowed moments that its gradient needs.
+    /// [`SsimOps::ssim`], with the windowed moments that its gradient needs.
     fn ssim_tracked(
         inputs: SsimInputs<Self>,
         args: &SsimArgs,
     ) -> (FloatTensor<Self>, Vec<FloatTensor<Self>>);
 
-    /// Given the moments and the gradient of the map.
+    /// Gradients of both images, from the moments and the gradient of the map.
     fn ssim_backward(
         inputs: SsimInputs<Self>,
         moments: Vec<FloatTensor<Self>>,
@@ -301,15 +300,15 @@ pub trait PhotometricOps: Backend {
 
 /// The gradient of [`PhotometricOps`].
 pub trait PhotometricBackend: PhotometricOps {
-    /// [`PhotometricOps::photometric`], and what its gradient needs.
+    /// [`PhotometricOps::photometric`], with the state that its gradient needs.
     fn photometric_tracked(
         rendered: FloatTensor<Self>,
         target: Target<Self>,
         args: &SsimArgs,
     ) -> (FloatTensor<Self>, FloatTensor<Self>);
 
-    /// Gradient of the rendered images `[B, H, W, E]`, given what was kept and the gradient `[2]`
-    /// of the losses.
+    /// Gradient of the rendered images `[B, H, W, E]`, from the state and the gradient `[2]` of the
+    /// losses.
     fn photometric_backward(
         rendered: FloatTensor<Self>,
         target: Target<Self>,
@@ -322,7 +321,7 @@ pub trait PhotometricBackend: PhotometricOps {
 /// [`ScreenStatistics::add`](crate::ScreenStatistics::add). Not differentiable.
 #[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
 pub trait ScreenStatisticsOps: Backend {
-    /// The sums with the lengths of `half * gradient` and the views added.
+    /// Adds the lengths of `half * gradient` and the views to the sums.
     fn add_screen_statistics(
         #[extension_type] inputs: ScreenStatisticsInputs<Self>,
         half: [f64; 2],
@@ -336,7 +335,7 @@ pub trait AdamOps: Backend {
     fn adam(#[extension_type] inputs: AdamInputs<Self>, step: AdamStep) -> AdamOutputs<Self>;
 }
 
-/// Everything that the ops need of a backend.
+/// Everything that the ops need from a backend.
 pub trait SplatBackend:
     ProjectBackend
     + ScreenProbeOps

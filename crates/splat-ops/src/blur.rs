@@ -8,8 +8,8 @@ use crate::OpError;
 use crate::backend::BlurOps;
 use crate::check::Checker;
 
-/// Convolves the rows and columns of images `[B, H, W, D]` with one symmetric window, taking zero
-/// outside of the image. Differentiable in the image; being self-adjoint, it is its own gradient.
+/// Convolves the rows and columns of images `[B, H, W, D]` with a symmetric window; zero outside
+/// the image. Differentiable in the image; the op is self-adjoint, so it is its own gradient.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};
@@ -22,7 +22,7 @@ use crate::check::Checker;
 /// ```
 ///
 /// # Errors
-/// When the window's length is even or it is not symmetric.
+/// When the window is not symmetric or its length is even.
 pub fn gaussian_blur(image: Tensor<4>, window: &[f64]) -> Result<Tensor<4>, OpError> {
     let check = Checker::new("gaussian_blur", "image", &image)?;
     check.window(window)?;

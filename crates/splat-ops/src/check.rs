@@ -1,11 +1,11 @@
-//! Checks of inputs that all ops share.
+//! Input checks that all ops share.
 
 use burn::backend::DispatchDevice;
 use burn::tensor::{DType, Device, Tensor, kind::Basic};
 
 use crate::OpError;
 
-/// Checks the tensors of one call of one op against each other.
+/// Checks the tensors of one call against each other.
 pub(crate) struct Checker {
     op: &'static str,
     dtype: DType,
@@ -13,7 +13,7 @@ pub(crate) struct Checker {
 }
 
 impl Checker {
-    /// The first tensor sets the type and the device of the call.
+    /// The first tensor of a call, which sets its type and device.
     pub(crate) fn new<const R: usize>(
         op: &'static str,
         name: &'static str,
@@ -36,7 +36,7 @@ impl Checker {
         }
     }
 
-    /// A tensor of the same type, on the same device, of the given shape (`None`: any length).
+    /// Checks type, device and shape (`None`: any length).
     pub(crate) fn tensor<const R: usize>(
         &self,
         name: &'static str,
@@ -55,7 +55,7 @@ impl Checker {
         Ok(())
     }
 
-    /// A tensor of any kind and type, on the same device, of the given shape.
+    /// Checks device and shape of a tensor of any kind and type.
     pub(crate) fn place<const R: usize, K: Basic>(
         &self,
         name: &'static str,
@@ -86,7 +86,7 @@ impl Checker {
         Ok(())
     }
 
-    /// A window of a separable convolution.
+    /// Checks the window of a separable convolution.
     pub(crate) fn window(&self, window: &[f64]) -> Result<(), OpError> {
         let symmetric = window.iter().eq(window.iter().rev());
         if window.len().is_multiple_of(2) || !symmetric {
@@ -111,7 +111,7 @@ impl Checker {
     }
 }
 
-/// Whether a device, without autodiff, is that of Burn's Flex backend.
+/// True for devices of Burn's Flex backend, given without autodiff.
 pub(crate) fn is_flex(device: &Device) -> bool {
     #[cfg(feature = "cpu")]
     return matches!(device.as_dispatch(), DispatchDevice::Flex(_));

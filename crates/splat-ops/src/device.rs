@@ -1,6 +1,5 @@
-//! Device utilities, mainly for benchmarks of CubeCL devices: what they are, what the kernels did
-//! there, how fast their memory is. Without such a device (or the features for one) there is
-//! nothing to tell.
+//! Device utilities, mainly for benchmarks of CubeCL devices: properties, counts of kernel work,
+//! memory bandwidth. They return nothing for other devices, or without the features for CubeCL.
 
 use burn::tensor::{Device, Tensor};
 
@@ -10,29 +9,28 @@ use crate::check::is_flex;
 use crate::{Projected, RasterizeSettings, RasterizeWork};
 pub use splat_core::memory::available_memory;
 
-/// Work of the kernels since the process began, over all devices; a piece of work is a difference
-/// of two.
+/// Work of the kernels since the start of the process, over all devices. Subtract two to measure a
+/// piece of work.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct KernelWork {
-    /// Kernels of ours that were launched; those of Burn are not seen here.
+    /// Launches of this project's kernels; Burn's are not counted.
     pub launches: u64,
-    /// Intersections of splats and tiles that were listed.
+    /// Intersections listed, each of a splat and a tile.
     pub intersections: u64,
-    /// Bytes reserved for results and scratch of our kernels; the same memory may be reserved many
-    /// times.
+    /// Bytes reserved for results and scratch; the same memory counts every time it is reserved.
     pub reserved_bytes: u64,
-    /// How often our kernels made the host wait for the device.
+    /// Times that the host waited for the device.
     pub waits: u64,
 }
 
-/// How large a training step is, for [`step_floor`].
+/// Size of a training step, for [`step_floor`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct StepSizes {
     /// Gaussians.
     pub gaussians: u64,
-    /// Those that reach into the view.
+    /// Gaussians that reach into the view.
     pub visible: u64,
-    /// Intersections of splats and tiles.
+    /// Intersections, each of a splat and a tile.
     pub intersections: u64,
     /// Width of the view in pixels.
     pub width: u64,
@@ -40,7 +38,7 @@ pub struct StepSizes {
     pub height: u64,
     /// Degree of spherical harmonics that is evaluated.
     pub sh_degree: usize,
-    /// Floats of one Gaussian that are trained.
+    /// Trained floats per Gaussian.
     pub parameters: u64,
 }
 
@@ -54,11 +52,11 @@ pub(crate) fn client(device: &Device) -> Option<cubecl::client::Client> {
     }
 }
 
-/// The values of a float tensor on the host, in single precision.
+/// Reads a float tensor to the host, in single precision.
 ///
 /// # Errors
-/// [`OpError::Device`] when the device failed, then or in whatever the tensor was computed by: a
-/// device that works on its own says so only when something is read.
+/// [`OpError::Device`] when the device failed, now or while computing the tensor: an asynchronous
+/// device reports errors only when something is read.
 pub fn to_host<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>, OpError> {
     let failed = |what: String| OpError::Device {
         op: "reading a tensor",
@@ -71,11 +69,13 @@ pub fn to_host<const D: usize>(tensor: Tensor<D>) -> Result<Vec<f32>, OpError> {
     values.map_err(|error| failed(format!("{error:?}")))
 }
 
-/// To be called where a training step or the like begins. On the CPU the threads that share the
-/// work of an op, those of the pool that the caller is in or else of rayon's global one, otherwise
-/// fall asleep behind each, and to wake one takes as long as a small op: on two threads, a
-/// twentieth of a step of 15,000 Gaussians. From here on they look for work instead, until there
-/// was none for much longer than a step lies between two ops. Elsewhere this does nothing.
+/// Keeps CPU worker threads awake between the ops of a training step; call it at the start of each
+/// step.
+///
+/// The threads are those of the rayon pool that the caller runs in, else of the global one. By
+/// default they sleep after each op, and waking one takes as long as a small op: on two threads, a
+/// twentieth of a step of 15,000 Gaussians. After this call they spin until there has been no work
+/// for much longer than the gap between two ops. Does nothing on other devices.
 pub fn keep_awake(device: &Device) {
     if is_flex(&device.clone().without_autodiff()) {
         #[cfg(feature = "cpu")]
@@ -83,8 +83,8 @@ pub fn keep_awake(device: &Device) {
     }
 }
 
-/// Properties of a CubeCL device, and which variant of the kernels runs there: name and value, in
-/// an order for reading. `None` for any other device.
+/// Properties of a CubeCL device and the kernel variants that run on it, as names and values in
+/// display order. `None` for other devices.
 pub fn device_info(device: &Device) -> Option<Vec<(&'static str, String)>> {
     #[cfg(feature = "cube")]
     return client(device).map(|client| splat_kernels::device_info(&client));
@@ -95,8 +95,8 @@ pub fn device_info(device: &Device) -> Option<Vec<(&'static str, String)>> {
     }
 }
 
-/// Whether [`sh_colors`](crate::sh_colors) reads coefficients in half precision (F16) on a device
-/// as they are. Where it does not, it makes others of them, which costs more than it saves.
+/// True if [`sh_colors`](crate::sh_colors) reads half-precision (F16) coefficients directly on this
+/// device. Elsewhere it converts them, which costs more than it saves.
 pub fn reads_half(device: &Device) -> bool {
     #[cfg(feature = "cube")]
     return client(device).is_some_and(|client| splat_kernels::reads_half(&client));
@@ -124,7 +124,7 @@ pub fn kernel_work() -> KernelWork {
 }
 
 impl KernelWork {
-    /// The difference to `earlier`.
+    /// Work done after `earlier`.
     #[must_use]
     pub fn since(self, earlier: Self) -> Self {
         Self {
@@ -136,9 +136,9 @@ impl KernelWork {
     }
 }
 
-/// Bytes of device memory that the kernels of a training step with three colours cannot do without:
-/// by stage, in order, read and written together. `splat_kernels::floor` says what is counted and
-/// what is estimated. `None` where the device is none of CubeCL.
+/// Bytes of device memory that a training step with three colour channels must read and write, by
+/// stage, in order. `splat_kernels::floor` states what is counted and what is estimated. `None` for
+/// devices other than CubeCL's.
 pub fn step_floor(device: &Device, sizes: &StepSizes) -> Option<Vec<(&'static str, u64)>> {
     #[cfg(feature = "cube")]
     {
@@ -163,11 +163,11 @@ pub fn step_floor(device: &Device, sizes: &StepSizes) -> Option<Vec<(&'static st
     }
 }
 
-/// Bytes per second, read and written together, of a plain kernel that copies `bytes`: what a stage
-/// bound by memory could reach. `None` where the device is none of CubeCL.
+/// Bandwidth of a plain copy kernel over `bytes`, in bytes read and written per second: the limit
+/// of a memory-bound stage. `None` for devices other than CubeCL's.
 ///
 /// # Errors
-/// The device's error.
+/// When the device fails.
 pub fn copy_bandwidth(device: &Device, bytes: usize) -> Result<Option<f64>, OpError> {
     #[cfg(feature = "cube")]
     {
@@ -186,13 +186,13 @@ pub fn copy_bandwidth(device: &Device, bytes: usize) -> Result<Option<f64>, OpEr
     }
 }
 
-/// Counts the work of [`rasterize`](crate::rasterize) with the same arguments, by doing it on their
-/// device.
+/// Counts the work of [`rasterize`](crate::rasterize) with the same arguments by running it on
+/// their device.
 ///
-/// A CubeCL device tests other pairs than the CPU: there a block of the tile's pixels (8 x 8, or 4
-/// x 4 where planes are not known) walks all splats of the tile whose ellipse meets the block, each
-/// at all pixels of the block that are still open. On the CPU rows are cut to the ellipse in steps
-/// of eight pixels.
+/// A CubeCL device tests other pairs than the CPU. There a block of the tile's pixels (8 x 8, or 4
+/// x 4 if the plane size is not known) walks all splats of the tile whose ellipse meets the block,
+/// at all pixels of the block that are still open. The CPU cuts rows to the ellipse in steps of
+/// eight pixels.
 ///
 /// # Errors
 /// As [`rasterize`](crate::rasterize).

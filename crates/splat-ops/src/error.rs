@@ -1,10 +1,10 @@
-//! Errors of the ops, and how they get past Burn's dispatch.
+//! Errors of the ops, and how they pass through Burn's dispatch.
 
 use std::sync::{Arc, OnceLock};
 
 use burn::tensor::DType;
 
-/// An input that an op refuses, or a device that failed.
+/// An input that an op refuses, or a device failure.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum OpError {
     /// A tensor has the wrong shape.
@@ -14,12 +14,13 @@ pub enum OpError {
         op: &'static str,
         /// The argument.
         tensor: &'static str,
-        /// The shape it must have, in letters.
+        /// The expected shape, in letters.
         expected: &'static str,
-        /// The shape it has.
+        /// The actual shape.
         got: Vec<usize>,
     },
-    /// A tensor has a type that its device cannot compute with, or another than the first one.
+    /// A tensor has a type that its device does not support, or that differs from the first
+    /// tensor's.
     #[error("{op}: `{tensor}` has type {got:?}; {reason}")]
     DType {
         /// The op.
@@ -36,7 +37,7 @@ pub enum OpError {
     Argument {
         /// The op.
         op: &'static str,
-        /// The fault, and the range allowed.
+        /// The fault and the allowed range.
         what: String,
     },
     /// The splats touch more tiles than one call can list.
@@ -47,12 +48,12 @@ pub enum OpError {
     TooManyIntersections {
         /// The op.
         op: &'static str,
-        /// Intersections of a splat and a tile.
+        /// Intersections, each of a splat and a tile.
         intersections: u64,
-        /// How many of them can be listed.
+        /// Most intersections that can be listed.
         limit: u64,
     },
-    /// The lists of splats by tile need more memory than this process can get.
+    /// The tile lists need more memory than this process can get.
     #[error(
         "{op}: {intersections} intersections of a splat and a tile need {needed} of memory, and {left} can be had. \
          Render a smaller image, fewer cameras per call, or remove Gaussians: huge ones first"
@@ -60,14 +61,14 @@ pub enum OpError {
     OutOfMemory {
         /// The op.
         op: &'static str,
-        /// Intersections of a splat and a tile.
+        /// Intersections, each of a splat and a tile.
         intersections: u64,
         /// Memory needed, in words.
         needed: String,
         /// Memory left, in words.
         left: String,
     },
-    /// A kernel needs more buffers than the device lets it have.
+    /// A kernel needs more buffers than the device can bind.
     #[error(
         "{op}: this device lets a kernel bind {bound} storage buffers (wgpu's limit \
          `max_storage_buffers_per_shader_stage`, less one for CubeCL), and {needed} are needed. Choose another device, \
@@ -76,9 +77,9 @@ pub enum OpError {
     TooFewBindings {
         /// The op.
         op: &'static str,
-        /// How many a kernel can bind.
+        /// Buffers that a kernel can bind.
         bound: u32,
-        /// How many the op needs.
+        /// Buffers that the op needs.
         needed: u32,
     },
     /// The device failed.
@@ -86,24 +87,24 @@ pub enum OpError {
     Device {
         /// The op.
         op: &'static str,
-        /// In the device's words.
+        /// The device's message.
         what: String,
     },
 }
 
-/// Where a backend leaves the error of an op. Burn's dispatch brings back tensors and nothing else,
-/// so the error takes this way round it. Clones share one slot; the first error stays.
+/// Slot for the error of an op. Burn's dispatch returns only tensors, so backends leave errors
+/// here. Clones share one slot, and the first error stays.
 #[derive(Debug, Clone, Default)]
 pub struct ErrorSlot(Arc<OnceLock<OpError>>);
 
 impl ErrorSlot {
-    /// Leaves an error for the op's caller. The tensors that the backend then returns are dropped.
+    /// Leaves an error for the op's caller, which then drops the tensors that the backend returns.
     pub fn report(&self, error: OpError) {
-        // Only the first one tells what went wrong; what follows from it does not.
+        // Later errors are consequences of the first.
         let _ = self.0.set(error);
     }
 
-    /// The error, if there was one.
+    /// The error, if any.
     pub fn error(&self) -> Option<&OpError> {
         self.0.get()
     }

@@ -1,5 +1,4 @@
-//! The photometric loss of splatting: L1 and structural similarity of what was rendered and a
-//! photo.
+//! The photometric loss of splatting: L1 and structural similarity of a rendered image and a photo.
 
 use burn::backend::Dispatch;
 use burn::tensor::{Int, Tensor};
@@ -13,8 +12,8 @@ use crate::settings::SsimArgs;
 /// Images that [`photometric`] compares with, `[B, H, W, D]`.
 #[derive(Debug, Clone)]
 pub enum Target {
-    /// 8-bit levels, 0 to 255, that stand for `level / 255`. Of type U8 they are read as they are,
-    /// on GPUs of type I32 too.
+    /// 8-bit levels, 0 to 255, meaning `level / 255`. U8 tensors are read directly, on GPUs I32
+    /// tensors too.
     Levels(Tensor<4, Int>),
     /// The values themselves.
     Values(Tensor<4>),
@@ -39,9 +38,9 @@ pub struct Photometric {
 }
 
 impl Photometric {
-    /// `[2]`: the mean absolute difference and one less the mean structural similarity, the terms
-    /// of 3DGS eq. 7, both zero for equal images. Nothing is cut: a loss that weighs and adds them
-    /// as they are has the least to do.
+    /// Both losses, `[2]`: the mean absolute difference, and one minus the mean structural
+    /// similarity (the terms of 3DGS eq. 7). Both are zero for equal images. Weighting this tensor
+    /// directly is cheaper than slicing it.
     pub fn losses(&self) -> Tensor<1> {
         self.losses.clone()
     }
@@ -57,15 +56,17 @@ impl Photometric {
     }
 }
 
-/// Mean absolute difference and mean structural similarity (Wang et al. 2004, eq. 13) of images
-/// `[B, H, W, E]` and a target `[B, H, W, D]`, over the first D of the E channels: what
-/// [`rasterize`](crate::rasterize) returns packed needs no cutting. The similarity, that of
-/// [`ssim_map`](crate::ssim_map), is the mean over channels and over the pixels whose window lies
-/// inside of the image, as scikit-image, torchmetrics and gsplat have it; in an image smaller than
-/// the window every pixel counts.
+/// Mean absolute difference and mean structural similarity (Wang et al. 2004, eq. 13) of rendered
+/// images and a target.
 ///
-/// Differentiable in the images; other channels than the first D have a gradient of zero. The
-/// target is a constant.
+/// Compares images `[B, H, W, E]` with a target `[B, H, W, D]` over the first D of the E channels,
+/// so the packed output of [`rasterize`](crate::rasterize()) needs no slicing. The similarity is
+/// that of [`ssim_map`](crate::ssim_map), averaged over channels and over the pixels whose window
+/// lies inside the image, as in scikit-image, torchmetrics and gsplat. In an image smaller than the
+/// window every pixel counts.
+///
+/// Differentiable in the images; channels beyond the first D get a gradient of zero. The target is
+/// a constant.
 ///
 /// ```
 /// use burn::tensor::{Device, Int, Tensor};
@@ -83,8 +84,8 @@ impl Photometric {
 /// ```
 ///
 /// # Errors
-/// When shapes, types or devices do not fit, the target is tracked by autodiff, or the window's
-/// length is even or it is not symmetric.
+/// When shapes, types or devices do not fit, the target is tracked by autodiff, or the window is
+/// not symmetric or its length is even.
 pub fn photometric(
     rendered: Tensor<4>,
     target: impl Into<Target>,
@@ -124,12 +125,14 @@ pub fn photometric(
     })
 }
 
-/// [`photometric`] of the pixels that a mask `[B, H, W, 1]` keeps (1; 0 leaves out), as gsplat has
-/// it: the mean absolute difference is that of the pixels kept, the structural similarity that of
-/// both images times the mask. A mask that keeps nothing gives a difference of zero.
+/// [`photometric`] over the pixels that a mask keeps, as in gsplat.
 ///
-/// Without a mask call [`photometric`], which reads bytes as they are; here the target becomes
-/// floats.
+/// The mask `[B, H, W, 1]` is 1 for pixels to keep and 0 for others. The mean absolute difference
+/// is that of the kept pixels; the structural similarity is that of both images times the mask. A
+/// mask that keeps nothing gives a difference of zero.
+///
+/// Without a mask use [`photometric`], which reads 8-bit levels directly; here the target is
+/// converted to floats.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};
@@ -148,7 +151,7 @@ pub fn photometric(
 /// ```
 ///
 /// # Errors
-/// As those of [`photometric`], and when the mask does not fit or is tracked by autodiff.
+/// Those of [`photometric`], and when the mask does not fit or is tracked by autodiff.
 pub fn photometric_masked(
     rendered: Tensor<4>,
     target: impl Into<Target>,
@@ -175,7 +178,7 @@ pub fn photometric_masked(
         "[B, H, W, D]",
     )?;
     let kept = mask.clone().sum();
-    // Chosen, not multiplied by zero, which would let a NaN through.
+    // Selected rather than multiplied by zero, which would let NaN through.
     let left_out = mask.clone().equal_elem(0.0);
     let channels_rendered = rendered.dims()[3];
     let masked = rendered * mask.clone().repeat_dim(3, channels_rendered);
@@ -183,7 +186,7 @@ pub fn photometric_masked(
     let values = values * mask.repeat_dim(3, channels);
     let values = values.mask_fill(left_out.repeat_dim(3, channels), 0.0);
     let losses = photometric(masked, values, args)?.losses();
-    // Of a mean over all pixels that over the pixels kept.
+    // Turns a mean over all pixels into one over the kept pixels.
     let share = kept.clamp_min(1.0).recip() * (b * h * w) as f64;
     let scale = Tensor::cat(vec![share.clone(), share.ones_like()], 0);
     Ok(Photometric {

@@ -1,4 +1,4 @@
-//! Sizes and settings of the ops. Every constant of the method is a field here, with its default.
+//! Sizes and settings of the ops. Every constant of the method is a field with a default.
 
 pub use splat_core::{
     Activation, AdamRows, AdamStep, ClampGradient, ImageSize, ProjectSettings, RasterizeSettings,
@@ -7,7 +7,7 @@ pub use splat_core::{
 
 use crate::ErrorSlot;
 
-/// Everything but tensors that a backend needs to project.
+/// Everything except tensors that a backend needs to project.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ProjectArgs {
     /// Image size.
@@ -16,15 +16,15 @@ pub struct ProjectArgs {
     pub settings: ProjectSettings,
 }
 
-/// Everything but tensors that a backend needs to rasterise.
+/// Everything except tensors that a backend needs to rasterise.
 #[derive(Debug, Clone)]
 pub struct RasterizeArgs {
     /// Image size.
     pub size: ImageSize,
     /// Settings.
     pub settings: RasterizeSettings,
-    /// Whether a backward pass follows: then there must be memory for it too.
+    /// True if a backward pass follows, which needs memory too.
     pub backward: bool,
-    /// For what goes wrong on the way.
+    /// Receives errors of the backend.
     pub errors: ErrorSlot,
 }

@@ -1,4 +1,4 @@
-//! Colours of Gaussians as cameras see them (3DGS section 4).
+//! View-dependent colours of Gaussians (3DGS section 4).
 
 use burn::backend::Dispatch;
 use burn::tensor::{DType, Tensor};
@@ -9,26 +9,29 @@ use crate::check::Checker;
 use crate::device::reads_half;
 use crate::{OpError, Projected, SH_DEGREE_MAX, ShColorSettings, sh_coefficient_count};
 
-/// Colours `[C, N, 3]` of N Gaussians in C cameras: `max(SH(mean - centre) + 0.5, 0)`, SH being
-/// [`spherical_harmonics`](crate::spherical_harmonics) of the coefficients `[sh0, sh_rest]`.
+/// Colours `[C, N, 3]` of N Gaussians in C cameras: `max(SH(mean - centre) + 0.5, 0)`.
 ///
-/// The same as that function between ordinary tensor ops, in one pass and without their copies.
+/// SH is [`spherical_harmonics`](crate::spherical_harmonics()) of the coefficients `[sh0,
+/// sh_rest]`.
+///
+/// One pass replaces that function and the tensor ops around it, without their copies.
 ///
 /// # Arguments
 /// - `sh0` `[N, 1, 3]`: coefficients of degree 0.
-/// - `sh_rest` `[N, R, 3]` with 1 + R >= (degree + 1)^2: those of the higher degrees. What is
-///   beyond `degree` is not read and gets zero gradient; at degree 0 none of it is read, and it is
-///   no part of the graph. May be of half precision (F16) if autodiff does not track it: half of
-///   the bytes to store and to read, each coefficient to 2^-11 of itself, all sums as ever.
+/// - `sh_rest` `[N, R, 3]` with 1 + R >= (degree + 1)^2: coefficients of the higher degrees. Those
+///   beyond `degree` are not read and get zero gradient; at degree 0 the tensor is not part of the
+///   graph. May be half precision (F16) if autodiff does not track it, which halves the bytes
+///   stored and read, rounds each coefficient to 2^-11 of itself, and leaves sums in full
+///   precision.
 /// - `means` `[N, 3]`: world space.
-/// - `centers` `[C, 3]`: where the cameras stand.
+/// - `centers` `[C, 3]`: camera centres in world space.
 /// - `settings`: the degree, 0 to 3, and the gradient of the clamp; a degree alone will do.
-/// - `seen`: the same Gaussians projected by the same cameras. Those that are culled there (no
-///   extent) are black and pass no gradient on; their coefficients are not read. Without it all
-///   colours are computed.
+/// - `seen`: the same Gaussians projected by the same cameras. Gaussians culled there (extent zero)
+///   are black and pass no gradient, and their coefficients are not read. If `None`, all colours
+///   are computed.
 ///
-/// A channel that is clamped at zero passes no gradient on, unless
-/// [`ClampGradient::Recovering`](crate::ClampGradient::Recovering) is asked for; one that is
+/// A channel clamped at zero passes no gradient, unless
+/// [`ClampGradient::Recovering`](crate::ClampGradient::Recovering) is set; a channel that is
 /// exactly zero does.
 ///
 /// ```
@@ -101,8 +104,8 @@ pub fn sh_colors(
     Ok(Tensor::from_dispatch(Dispatch::sh_colors(inputs, settings)))
 }
 
-/// Coefficients as the device of the op reads them: those in half precision as they are where its
-/// kernels can, and otherwise in the type of all other tensors.
+/// Coefficients in the type that the device reads: half precision where the kernels support it,
+/// else the type of the other tensors.
 fn readable(check: &Checker, rest: Tensor<3>, dtype: DType) -> Result<Tensor<3>, OpError> {
     if rest.dtype() != DType::F16 {
         check.tensor("sh_rest", &rest, [None; 3], "[N, R, 3]")?;

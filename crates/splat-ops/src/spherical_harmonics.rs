@@ -1,4 +1,4 @@
-//! View-dependent colour as spherical harmonics (3DGS section 4).
+//! View-dependent colour from spherical harmonics (3DGS section 4).
 
 use burn::backend::Dispatch;
 use burn::tensor::Tensor;
@@ -13,13 +13,14 @@ use crate::check::Checker;
 /// Evaluates real spherical harmonics in C x N directions.
 ///
 /// # Arguments
-/// - `coeffs` `[N, K, 3]` with K >= (degree + 1)^2; the rest is not read and gets zero gradient.
-/// - `dirs` `[C, N, 3]`: from the camera to the Gaussian, any length; normalised here. A direction
-///   of length zero counts as the zero vector: it keeps degree 0 and has no gradient.
+/// - `coeffs` `[N, K, 3]` with K >= (degree + 1)^2; further ones are not read and get zero
+///   gradient.
+/// - `dirs` `[C, N, 3]`: from the camera to the Gaussian, of any length; normalised here. A
+///   direction of length zero keeps degree 0 only and has no gradient.
 /// - `degree`: 0 to 3.
 ///
-/// Returns the plain sum `[C, N, 3]`, in the basis and with the constants of 3DGS. The model adds
-/// 0.5 and clamps at zero.
+/// Returns the plain sum `[C, N, 3]`, in the basis and with the constants of 3DGS. The model then
+/// adds 0.5 and clamps at zero.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};

@@ -1,4 +1,4 @@
-//! Structural similarity, pixel by pixel (Wang et al. 2004, eq. 13).
+//! Structural similarity per pixel (Wang et al. 2004, eq. 13).
 
 use core::ops::Range;
 
@@ -11,14 +11,14 @@ use crate::backend::{OpInputs, SsimOps, SsimTensors};
 use crate::check::Checker;
 use crate::settings::SsimArgs;
 
-/// Structural similarity of two images `[B, H, W, D]` at every pixel and channel, `[B, H, W, D]`,
-/// zeros outside of the images:
+/// Structural similarity of two images `[B, H, W, D]` at every pixel and channel; zero outside the
+/// images.
 ///
 /// ```text
 /// S = (2 mx my + c1) (2 (E[xy] - mx my) + c2) / ((mx^2 + my^2 + c1) (E[x^2 + y^2] - mx^2 - my^2 + c2))
 /// ```
 ///
-/// where m and E are means under the window. Differentiable in both images.
+/// Here m and E are means under the window. Differentiable in both images.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};
@@ -32,7 +32,7 @@ use crate::settings::SsimArgs;
 /// ```
 ///
 /// # Errors
-/// When shapes, types or devices differ, or the window's length is even or it is not symmetric.
+/// When shapes, types or devices differ, or the window is not symmetric or its length is even.
 pub fn ssim_map(x: Tensor<4>, y: Tensor<4>, args: &SsimArgs) -> Result<Tensor<4>, OpError> {
     let check = Checker::new("ssim_map", "x", &x)?;
     check.tensor("y", &y, x.dims().map(Some), "that of `x`")?;
@@ -45,8 +45,8 @@ pub fn ssim_map(x: Tensor<4>, y: Tensor<4>, args: &SsimArgs) -> Result<Tensor<4>
     Ok(Tensor::from_dispatch(Dispatch::ssim(inputs, args.clone())))
 }
 
-/// The rows and columns of the pixels of an image of `[height, width]` whose window lies inside;
-/// all of them where there is none.
+/// Rows and columns of the pixels of a `[height, width]` image whose window lies inside; all of
+/// them if none does.
 pub(crate) fn counted([height, width]: [usize; 2], window: usize) -> [Range<usize>; 2] {
     let radius = if height < window || width < window {
         0

@@ -1,4 +1,5 @@
-//! `exp` and `sigmoid`: save input and output; each gradient takes what is exact for it.
+//! `exp` and `sigmoid`: save input and output, and compute each gradient from the one that is exact
+//! for it.
 
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};

@@ -1,4 +1,5 @@
-//! An optimiser's step is no part of any graph: what comes out is new leaves.
+//! Adam on the autodiff backend: an optimiser step is outside every graph, so its outputs are new
+//! leaves.
 
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, AutodiffBackend};

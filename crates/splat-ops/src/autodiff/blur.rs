@@ -1,4 +1,4 @@
-//! `gaussian_blur`: linear and self-adjoint, so nothing but the window is saved.
+//! `gaussian_blur`: linear and self-adjoint, so only the window is saved.
 
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};

@@ -1,9 +1,9 @@
-//! The ops on Burn's autodiff backend: one file per op says what is saved and how the gradient
+//! The ops on Burn's autodiff backend. One file per op states what is saved and how the gradient
 //! flows.
 //!
-//! A tracked op has N parents and one output; only gradients of tracked parents are asked of the
-//! backend. Every gradient runs in a `tracing` span of its op's name, level trace, on the caller's
-//! thread: one load and a branch where nobody listens.
+//! A tracked op has N parents and one output; the backend computes gradients of tracked parents
+//! only. Every gradient runs in a `tracing` span of its op's name, at level trace, on the caller's
+//! thread.
 
 mod activation;
 mod adam;
@@ -27,7 +27,7 @@ use burn::backend::{Autodiff, Backend, tensor::FloatTensor};
 
 /// State that an op saves for the gradients of its N parents.
 trait Saved<B: Backend, const N: usize>: Clone + Debug + Send + 'static {
-    /// Gradients of the parents that need one, given that of the output.
+    /// Gradients of the parents that need one, given the gradient of the output.
     fn gradients(self, grad: FloatTensor<B>, needs_grad: [bool; N]) -> [Option<FloatTensor<B>>; N];
 }
 
@@ -51,7 +51,7 @@ impl<B: Backend, S: Saved<B, N>, const N: usize> Backward<B, N> for Recorded<S> 
     }
 }
 
-/// Runs an op: `tracked` where one of its parents is, and `plain` otherwise, which keeps nothing.
+/// Runs an op: `tracked` if a parent is tracked, else `plain`, which keeps nothing.
 fn record<B: Backend, C: CheckpointStrategy, S: Saved<B, N>, I, const N: usize>(
     parents: [NodeGuard; N],
     inputs: I,

@@ -1,4 +1,4 @@
-//! `photometric`: saves both images and what the backend has made in passing for the gradient.
+//! `photometric`: saves both images and the intermediate results of the backend.
 
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};

@@ -1,4 +1,4 @@
-//! `project`: saves its five inputs; the backward recomputes what lies between.
+//! `project`: saves its five inputs; the backward pass recomputes the intermediates.
 
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};

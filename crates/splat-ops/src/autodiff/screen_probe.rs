@@ -1,4 +1,5 @@
-//! `screen_probe`: splats pass unchanged, and so does their gradient, which the probe gets too.
+//! `screen_probe`: passes splats and their gradient through unchanged, and gives the gradient to
+//! the probe too.
 
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};

@@ -1,5 +1,5 @@
-//! `sh_colors`: saves its inputs. At degree 0 the coefficients of that degree are the only parent;
-//! what was seen never is one.
+//! `sh_colors`: saves its inputs. At degree 0 the degree 0 coefficients are the only parent; `seen`
+//! never is a parent.
 
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};

@@ -4,7 +4,7 @@ use burn::backend::{Backend, tensor::FloatTensor};
 
 use crate::settings::Activation;
 
-/// The function of every element.
+/// Applies the function to every element.
 pub(crate) fn activation<B: Backend>(x: FloatTensor<B>, function: Activation) -> FloatTensor<B> {
     match function {
         Activation::Exp => B::float_exp(x),
@@ -22,7 +22,7 @@ fn one_and_small<B: Backend>(x: FloatTensor<B>) -> (FloatTensor<B>, FloatTensor<
     (small.clone(), B::float_add_scalar(small, 1.0.into()))
 }
 
-/// `grad y'`; of the logistic function `y' = e / (1 + e)^2`, which keeps its digits at both ends.
+/// `grad y'`; for the logistic function `y' = e / (1 + e)^2`, which is accurate at both ends.
 pub(crate) fn activation_backward<B: Backend>(
     x: FloatTensor<B>,
     y: FloatTensor<B>,

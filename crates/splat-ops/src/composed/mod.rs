@@ -1,5 +1,5 @@
-//! Ops composed of Burn's tensor ops, for backends that have nothing of their own, and for what
-//! their own do not cover: other types than f32, windows too long for a workgroup's memory.
+//! Ops composed of Burn's tensor ops, for backends without an implementation of their own and for
+//! inputs that theirs does not cover: types other than f32, windows too long for shared memory.
 
 mod activation;
 #[cfg(feature = "cube")]

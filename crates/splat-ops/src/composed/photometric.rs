@@ -1,4 +1,4 @@
-//! The loss.
+//! The photometric loss.
 
 use core::ops::Range;
 
@@ -10,7 +10,7 @@ use crate::backend::{OpInputs, SsimBackend, SsimTensors, Target};
 use crate::settings::SsimArgs;
 use crate::ssim::counted;
 
-/// The target as values, and as many channels of what was rendered.
+/// The target as values, and the matching channels of the rendered images.
 fn images<B: Backend>(rendered: FloatTensor<B>, target: Target<B>) -> SsimTensors<FloatTensor<B>> {
     let target = match target {
         Target::Values(values) => values,
@@ -29,14 +29,14 @@ fn images<B: Backend>(rendered: FloatTensor<B>, target: Target<B>) -> SsimTensor
     }
 }
 
-/// Where in `[B, H, W, D]` the values lie that count for the mean similarity.
+/// Slices of `[B, H, W, D]` that count for the mean similarity.
 fn counted_part<B: Backend>(map: &FloatTensor<B>, args: &SsimArgs) -> [Range<usize>; 4] {
     let [b, h, w, d] = map.shape().dims();
     let [rows, columns] = counted([h, w], args.window.len());
     [0..b, rows, columns, 0..d]
 }
 
-/// The mean absolute difference, and one less the mean of the counted part of the similarity.
+/// The mean absolute difference, and one minus the mean similarity of the counted part.
 fn losses<B: Backend>(
     SsimTensors { x, y }: SsimTensors<FloatTensor<B>>,
     map: FloatTensor<B>,
@@ -60,7 +60,7 @@ pub(crate) fn photometric<B: SsimBackend>(
     losses::<B>(images, map, args)
 }
 
-/// The same, and the gradient of the mean similarity.
+/// [`photometric`], with the gradient of the mean similarity.
 pub(crate) fn photometric_tracked<B: SsimBackend>(
     rendered: FloatTensor<B>,
     target: Target<B>,
@@ -80,7 +80,7 @@ pub(crate) fn photometric_tracked<B: SsimBackend>(
     let inputs = OpInputs(images.clone());
     let needs_grad = SsimTensors { x: true, y: false };
     let slope = B::ssim_backward(inputs, moments, weights, args, needs_grad).x;
-    // A backend that has not computed what it was asked for has nothing to add.
+    // A backend that was not asked for the slope contributes zero.
     let kept = slope.unwrap_or_else(|| B::float_zeros(map.shape(), &device, dtype));
     (losses::<B>(images, map, args), kept)
 }

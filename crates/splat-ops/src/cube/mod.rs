@@ -1,7 +1,7 @@
 //! Launches `splat-kernels` on CubeCL devices: CUDA, Vulkan, Metal, WebGPU.
 //!
-//! The kernels know buffers of f32 and sizes; here tensors become buffers and buffers tensors.
-//! A `tracing` span of an op lasts as long as it takes to launch its kernels: these run on.
+//! Tensors become buffers and buffers tensors here; the kernels know only buffers of f32 and sizes.
+//! A `tracing` span of an op covers the launch of its kernels, not their execution.
 
 mod activation;
 mod adam;
@@ -38,13 +38,13 @@ fn prepare(tensor: CubeTensor) -> CubeTensor {
 /// The memory of a tensor that went through [`prepare`].
 fn buffer(tensor: &CubeTensor) -> Buffer {
     let len = tensor.shape().num_elements();
-    // A contiguous tensor of f32 holds its elements. One that did not would be read as empty: every
+    // A contiguous f32 tensor holds its elements. One that did not would be read as empty; every
     // kernel checks bounds.
     Buffer::new(tensor.handle.clone(), len).unwrap_or_else(|_| Buffer::empty(&tensor.client, 0))
 }
 
-/// The same, of a tensor that nothing else needs: where nothing else holds the memory, a kernel may
-/// write into it. And what makes a tensor of a buffer, like the one that was taken.
+/// The buffer of a tensor that the caller gives up, so that a kernel may write into it if nothing
+/// else holds the memory; and a function that turns a buffer into a tensor like it.
 fn taken(tensor: CubeTensor) -> (Buffer, impl FnOnce(Buffer) -> CubeTensor) {
     let shape = tensor.shape();
     let CubeTensor {
@@ -73,7 +73,7 @@ fn tensor(like: &CubeTensor, buffer: Buffer, shape: Shape) -> CubeTensor {
     )
 }
 
-/// Gradients of inputs, in the memory of buffers: each of the shape of its input.
+/// Gradients of inputs, from buffers; each has the shape of its input.
 fn gradients<const N: usize>(
     grads: [Option<Buffer>; N],
     inputs: [Option<&CubeTensor>; N],

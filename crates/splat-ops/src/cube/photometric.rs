@@ -1,5 +1,5 @@
-//! The photometric loss on CubeCL devices. The photo is read as it is stored. A window so long that
-//! its tiles do not fit into shared memory takes the way of tensor ops.
+//! The photometric loss on CubeCL devices. The photo is read as it is stored. Windows whose tiles
+//! do not fit into shared memory fall back to tensor ops.
 
 use burn::backend::TensorMetadata;
 use burn::tensor::{DType, Shape};
@@ -33,7 +33,7 @@ fn shape(rendered: &CubeTensor, target: &Target<CubeBackend>, args: &SsimArgs) -
     }
 }
 
-/// Both images, in memory as the kernels read it.
+/// Both images, in the memory layout of the kernels.
 struct Pictures {
     rendered: CubeTensor,
     values: Buffer,
@@ -75,7 +75,7 @@ fn words(target: Target<CubeBackend>) -> (Buffer, TargetKind) {
         _ => (cast(levels, DType::I32), count, TargetKind::Words),
     };
     let levels = into_contiguous(levels);
-    // As in `buffer`, a tensor that does not hold its elements would be read as empty.
+    // As in `buffer`: a tensor that does not hold its elements would be read as empty.
     let memory = Buffer::new(levels.handle.clone(), words);
     let memory = memory.unwrap_or_else(|_| Buffer::empty(&levels.client, 0));
     (memory, kind)

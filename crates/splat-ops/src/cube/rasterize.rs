@@ -19,7 +19,7 @@ use crate::backend::{
 };
 use crate::settings::RasterizeArgs;
 
-/// Sizes, from colours `[C, N, D]`.
+/// Sizes of a call, from colours `[C, N, D]`.
 fn frames(colors: &CubeTensor, args: &RasterizeArgs) -> Frames {
     let shape = colors.shape();
     Frames {
@@ -56,8 +56,9 @@ fn op_error(error: IntersectError) -> OpError {
     }
 }
 
-/// The rasteriser's gradient binds the most buffers. wgpu would refuse its kernels when they are
-/// launched, which shows when a gradient is read, if it is.
+/// Checks that the device can bind the buffers of the rasteriser's gradient, which needs the most.
+/// Without the check wgpu would refuse those kernels at launch, and the error would only appear
+/// when a gradient is read.
 fn enough_bindings(client: &Client) -> Result<(), OpError> {
     let (bound, needed) = (bindable_buffers(client), MOST_BUFFERS);
     if bound >= needed {
@@ -81,7 +82,7 @@ impl RasterizeOps for CubeBackend {
 }
 
 impl RasterizeBackend for CubeBackend {
-    /// `None`: nothing was rendered, see [`RasterizeArgs::errors`].
+    /// `None` if nothing was rendered; see [`RasterizeArgs::errors`].
     type RasterizeState = Option<RasterizeState>;
 
     fn rasterize_tracked(
@@ -140,8 +141,8 @@ impl RasterizeBackend for CubeBackend {
     }
 }
 
-/// The evaluations of a forward pass, counted on the device of `client`. Through the host: packed
-/// splats, colours `[C, N, D]` and opacities `[C, N]` are measured once, not often.
+/// Counts the evaluations of a forward pass on the device of `client`. Packed splats, colours `[C,
+/// N, D]` and opacities `[C, N]` go through the host, as this is called once per measurement.
 #[cfg(feature = "cpu")]
 pub(crate) fn work(
     client: &Client,

@@ -1,4 +1,4 @@
-//! Colours in the directions of the cameras, on CubeCL devices.
+//! View-dependent colours on CubeCL devices.
 
 use burn::backend::TensorMetadata;
 use burn::tensor::{DType, Shape};
@@ -14,8 +14,7 @@ use crate::backend::{
 };
 use crate::settings::ShColorSettings;
 
-/// The inputs, ready for the kernels, which read the higher coefficients in both of the types that
-/// the op takes.
+/// The inputs, ready for the kernels. Higher coefficients are read as f32 or f16.
 fn prepared(
     inputs: ShColorTensors<CubeTensor, Option<CubeTensor>>,
 ) -> ShColorTensors<CubeTensor, Option<CubeTensor>> {

@@ -33,7 +33,7 @@ impl SsimOps for CubeBackend {
 }
 
 impl SsimBackend for CubeBackend {
-    /// Keeps one tensor: the windowed means `[4, B, H, W, D]`.
+    /// Keeps the windowed means as one tensor `[4, B, H, W, D]`.
     fn ssim_tracked(
         OpInputs(inputs): SsimInputs<Self>,
         args: &SsimArgs,
