@@ -1,5 +1,5 @@
-//! What the ops of a training step take with their gradients, op by op, on the CPU and on the
-//! default wgpu adapter: `cargo bench -p splat-ops --bench ops`.
+//! Times the ops of a training step with their gradients, one by one, on the CPU and on the default
+//! wgpu adapter: `cargo bench -p splat-ops --bench ops`.
 
 use burn::tensor::{DType, Device, Int, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
@@ -26,7 +26,8 @@ fn devices() -> Vec<(&'static str, Device)> {
 
 const ROUNDS: u32 = 10;
 
-/// Seconds of processor time of this process, all threads; zero where the system does not say.
+/// Processor time of this process over all threads, in seconds; zero if the system does not report
+/// it.
 fn user_time() -> f64 {
     let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
     let fields = stat.rsplit(')').next().unwrap_or_default();
@@ -38,7 +39,7 @@ fn user_time() -> f64 {
 }
 
 fn measure(name: &str, device: &Device, mut run: impl FnMut()) {
-    // The first rounds compile.
+    // The first rounds include compilation.
     run();
     run();
     device.sync().unwrap();

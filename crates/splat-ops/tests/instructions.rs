@@ -1,4 +1,4 @@
-//! Sets of instructions, chosen for the whole process: no other test may run beside this one.
+//! Instruction sets are chosen for the whole process, so no other test may run beside this one.
 
 use burn::tensor::{Device, Distribution, Tensor, TensorData};
 use splat_ops::cpu::InstructionSet;
@@ -10,7 +10,7 @@ const SIZE: ImageSize = ImageSize {
 };
 const SPLATS: usize = 300;
 
-/// The image of some splats, and the gradient of what it is projected from.
+/// Image of some splats, and the gradient of the packed splats.
 fn rendered(packed: &TensorData, colors: &TensorData) -> [Vec<f32>; 2] {
     let device = Device::flex().autodiff();
     let packed = Tensor::<3>::from_data(packed.clone(), &device).require_grad();

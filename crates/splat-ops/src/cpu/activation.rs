@@ -1,4 +1,4 @@
-//! `exp`, the logistic function, and their gradients, element by element.
+//! `exp`, the logistic function, and their gradients, elementwise.
 
 use core::marker::PhantomData;
 
@@ -86,7 +86,7 @@ vectorized! {
 }
 
 vectorized! {
-    /// `exp(min(x, 0)) / (1 + exp(-|x|))`: one exponential is 1 or the other.
+    /// `exp(min(x, 0)) / (1 + exp(-|x|))`: one of the two exponentials is 1.
     fn sigmoid<T: Real, const FMA: bool>(x: &[T], y: &mut [T]) {
         for (y, x) in y.iter_mut().zip(x) {
             let small = T::exp::<FMA>(-x.abs());
@@ -97,7 +97,7 @@ vectorized! {
 }
 
 vectorized! {
-    /// `e / (1 + e)^2` with `e = exp(-|x|)`: no digit is lost at either end.
+    /// `e / (1 + e)^2` with `e = exp(-|x|)`, which loses no digits at either end.
     fn sigmoid_backward<T: Real, const FMA: bool>(x: &[T], grad: &[T], out: &mut [T]) {
         for ((out, x), grad) in out.iter_mut().zip(x).zip(grad) {
             let small = T::exp::<FMA>(-x.abs());

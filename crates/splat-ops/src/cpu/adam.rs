@@ -12,10 +12,10 @@ use super::simd::vectorized;
 use crate::backend::{AdamInputs, AdamOps, AdamOutputs, AdamTensors, OpInputs};
 use crate::settings::{AdamRows, AdamStep};
 
-/// Elements per unit of parallel work, about.
+/// Approximate number of elements per unit of parallel work.
 const CHUNK: usize = 8192;
 
-/// The numbers of a step in the precision of the tensors.
+/// Constants of a step, in the precision of the tensors.
 struct Numbers<T> {
     beta_1: T,
     beta_2: T,
@@ -31,7 +31,7 @@ impl AdamOps for Flex {
     }
 }
 
-/// Parameter and moments are written into their own memory, unless something else holds that too.
+/// Writes parameter and moments into their own memory, unless something else holds that memory too.
 fn step<T: Real>(
     _: PhantomData<T>,
     inputs: AdamTensors<FlexTensor>,
@@ -88,7 +88,7 @@ fn step<T: Real>(
 }
 
 vectorized! {
-    /// Steps a run of elements.
+    /// Steps a slice of elements.
     fn update<T: Real, const FMA: bool>(
         param: &mut [T],
         moment_1: &mut [T],

@@ -1,4 +1,4 @@
-//! Threads that wait for the next op without falling asleep.
+//! Keeps worker threads awake between ops.
 
 use core::cell::Cell;
 use core::time::Duration;
@@ -7,16 +7,16 @@ use std::time::Instant;
 
 use rayon::Yield;
 
-/// How long an idle thread spins before it sleeps. Ten times what a step of 15,000 Gaussians takes
-/// outside of the ops at a time (docs/PERFORMANCE.md, stages).
+/// How long an idle thread spins before it sleeps: ten times the gap between two ops in a step of
+/// 15,000 Gaussians (docs/PERFORMANCE.md, stages).
 const PATIENCE: Duration = Duration::from_micros(500);
 
 thread_local! {
-    /// Whether this thread looks for work.
+    /// True while this thread spins.
     static LOOKS: Cell<bool> = const { Cell::new(false) };
 }
 
-/// The other threads of the pool look for work from now on, until there was none for a while.
+/// Makes the other threads of the pool spin until there has been no work for a while.
 pub(crate) fn keep_awake() {
     let own = rayon::current_thread_index();
     if rayon::current_num_threads() > usize::from(own.is_some()) {
@@ -29,7 +29,7 @@ pub(crate) fn keep_awake() {
 }
 
 fn look_for_work() {
-    // It may find the next request to do so.
+    // A spinning thread may pick up the next request to spin.
     if LOOKS.replace(true) {
         return;
     }
@@ -54,7 +54,7 @@ mod tests {
         pool.unwrap()
     }
 
-    /// Which threads of the pool look for work once they are asked to.
+    /// Which threads of the pool are spinning, once asked to.
     fn looking() -> Vec<bool> {
         keep_awake();
         rayon::broadcast(|_| LOOKS.get())
@@ -62,7 +62,7 @@ mod tests {
 
     #[test]
     fn all_threads_but_the_callers_look_for_work() {
-        // A busy machine may stop a thread for longer than it looks.
+        // A busy machine may preempt a thread for longer than it spins.
         let asked = |expected: &dyn Fn(usize) -> bool| {
             (0..1000).any(|_| (looking().into_iter().enumerate()).all(|(i, on)| on == expected(i)))
         };
@@ -70,7 +70,7 @@ mod tests {
             let own = rayon::current_thread_index();
             asked(&|index| Some(index) != own)
         }));
-        // From outside of the pool there is none that has something else to do.
+        // From outside the pool, all threads are free to spin.
         assert!(asked(&|_| true));
     }
 
@@ -78,7 +78,7 @@ mod tests {
     fn threads_that_look_for_work_do_it_and_then_rest() {
         let pool = pool();
         let sum: usize = pool.install(|| {
-            // More requests than a stack could hold, were each answered inside of the last one.
+            // More requests than a stack could hold if each were answered inside the last one.
             for _ in 0..100_000 {
                 keep_awake();
             }
@@ -88,8 +88,8 @@ mod tests {
                 .sum()
         });
         assert_eq!(sum, (0..1000usize).map(|i| i.div_ceil(2)).sum::<usize>());
-        // A busy machine may stop a thread for longer than it looks, and asking is work too: ask
-        // again, less often.
+        // A busy machine may preempt a thread for longer than it spins, and asking is work too:
+        // retry, less often.
         assert!((0..1000).any(|_| {
             thread::sleep(10 * PATIENCE);
             pool.broadcast(|_| LOOKS.get()) == [false; 3]

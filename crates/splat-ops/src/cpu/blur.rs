@@ -1,4 +1,4 @@
-//! Separable convolution of images with a symmetric window, zeros outside.
+//! Separable convolution of images with a symmetric window; zero outside.
 
 use core::marker::PhantomData;
 
@@ -11,7 +11,7 @@ use super::real::Real;
 use super::simd::vectorized;
 use crate::backend::BlurOps;
 
-/// Values of a row that are summed at once.
+/// Values of a row summed at once.
 const LANES: usize = 16;
 
 impl BlurOps for Flex {
@@ -36,7 +36,7 @@ fn blur<T: Real>(_: PhantomData<T>, image: FlexTensor, window: &[f64]) -> FlexTe
     tensor(blurred, shape)
 }
 
-/// Rows of images `[B, H, W, D]`, and the window over them.
+/// Rows of images `[B, H, W, D]`, and the window.
 struct Rows<T> {
     /// H.
     height: usize,
@@ -57,7 +57,7 @@ impl<T: Real> Rows<T> {
         }
     }
 
-    /// Blurs along the rows.
+    /// Blurs along rows.
     fn along(&self, image: &[T]) -> Vec<T> {
         let margin = self.window.len() / 2 * self.pixel;
         let mut blurred = overwritten::<T>(image.len());
@@ -77,7 +77,7 @@ impl<T: Real> Rows<T> {
         blurred
     }
 
-    /// Blurs one row of an image down the columns.
+    /// Blurs one row of an image along the columns.
     fn down(&self, image: &[T], row: usize, out: &mut [T]) {
         let radius = self.window.len() / 2;
         let (first, y) = (row - row % self.height, row % self.height);
@@ -94,7 +94,7 @@ impl<T: Real> Rows<T> {
 }
 
 vectorized! {
-    /// `out[i] = sum of weights[k] sources[k][i]`, all of one length.
+    /// `out[i] = sum of weights[k] sources[k][i]`; all slices have one length.
     fn weighted_sum<T: Real, const FMA: bool>(out: &mut [T], sources: &[&[T]], weights: &[T]) {
         let whole = out.len() - out.len() % LANES;
         for start in (0..whole).step_by(LANES) {

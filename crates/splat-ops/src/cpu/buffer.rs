@@ -1,4 +1,4 @@
-//! Between Flex tensors and plain slices.
+//! Conversion between Flex tensors and slices.
 
 use burn::backend::TensorMetadata;
 use burn::backend::flex::FlexTensor;
@@ -7,7 +7,7 @@ use burn::tensor::{Element, TensorData};
 pub(crate) use super::overwritten::{overwritten, zeros};
 use super::real::Real;
 
-/// A tensor whose elements lie in one row-major slice.
+/// A tensor whose elements are one row-major slice.
 pub(super) struct Buffer {
     tensor: FlexTensor,
 }
@@ -19,7 +19,7 @@ impl Buffer {
         }
     }
 
-    /// The elements. The caller has chosen `T` by the tensor's type.
+    /// The elements. The caller chooses `T` by the tensor's type.
     pub(super) fn slice<T: Element + bytemuck::Pod>(&self) -> &[T] {
         self.tensor
             .as_slice()
@@ -31,8 +31,7 @@ impl Buffer {
     }
 }
 
-/// A tensor to be overwritten: in its own memory where nothing else holds that, in a copy
-/// otherwise.
+/// A tensor to overwrite: in its own memory if nothing else holds that, else in a copy.
 pub(super) struct BufferMut {
     tensor: FlexTensor,
 }
@@ -40,12 +39,12 @@ pub(super) struct BufferMut {
 impl BufferMut {
     pub(super) fn new(tensor: FlexTensor) -> Self {
         let contiguous = tensor.to_contiguous();
-        // Or its memory would count as shared.
+        // Dropped first, since its memory would otherwise count as shared.
         drop(tensor);
         Self { tensor: contiguous }
     }
 
-    /// The elements. The caller has chosen `T` by the tensor's type.
+    /// The elements. The caller chooses `T` by the tensor's type.
     pub(super) fn slice<T: Real>(&mut self) -> &mut [T] {
         self.tensor.storage_mut()
     }
@@ -55,7 +54,7 @@ impl BufferMut {
     }
 }
 
-/// A tensor of the given values.
+/// A tensor with the given values.
 pub(super) fn tensor<T: Real, const R: usize>(values: Vec<T>, shape: [usize; R]) -> FlexTensor {
     FlexTensor::from_data(TensorData::new(values, shape))
 }

@@ -1,17 +1,16 @@
-//! Which of the processor's instructions the inner loops use.
+//! Selection of the processor's instruction set for the inner loops.
 
 use core::fmt;
 use core::sync::atomic::{AtomicU8, Ordering};
 
 use macerator::Arch;
 
-/// A set of instructions that the loops are compiled for; a better one is greater.
+/// An instruction set that the loops are compiled for; better ones compare greater.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 pub enum InstructionSet {
-    /// The instructions of every processor of the target; the rasteriser uses SSE 4.2 where there
-    /// is that.
+    /// The baseline of the target; the rasteriser uses SSE 4.2 if available.
     Baseline,
-    /// 64-bit Arm, whose baseline has them.
+    /// 64-bit Arm, where it is the baseline.
     Neon,
     /// x86-64 with AVX2 and FMA.
     Avx2,
@@ -19,11 +18,11 @@ pub enum InstructionSet {
     Avx512,
 }
 
-/// The most that may run; all of them.
+/// The best set allowed to run; all by default.
 static MOST: AtomicU8 = AtomicU8::new(InstructionSet::Avx512 as u8);
 
 impl InstructionSet {
-    /// Those that this processor runs, the best one first.
+    /// Sets that this processor supports, best first.
     pub fn available() -> Vec<Self> {
         match Self::of(Arch::detect()) {
             Self::Avx512 => vec![Self::Avx512, Self::Avx2, Self::Baseline],
@@ -32,14 +31,14 @@ impl InstructionSet {
         }
     }
 
-    /// The one that runs.
+    /// The set in use.
     #[inline]
     pub fn chosen() -> Self {
         Self::of(registers())
     }
 
-    /// Does something with a set, or the best one that is no better, in place of the best one: to
-    /// measure and to compare. Holds for the whole process, until this returns.
+    /// Calls `run` with this set, or the best supported one below it, for measuring and comparing.
+    /// Applies to the whole process until it returns.
     pub fn at_most<R>(self, run: impl FnOnce() -> R) -> R {
         struct Restored(u8);
         impl Drop for Restored {
@@ -64,7 +63,7 @@ impl InstructionSet {
     }
 }
 
-/// The registers of the set that runs. The processor has them.
+/// Registers of the set in use, which the processor supports.
 #[inline]
 pub(super) fn registers() -> Arch {
     let best = Arch::detect();
@@ -72,7 +71,7 @@ pub(super) fn registers() -> Arch {
     {
         let most = MOST.load(Ordering::Relaxed);
         if most < InstructionSet::of(best) as u8 {
-            // A processor with AVX-512 has AVX2, and all that came before.
+            // AVX-512 implies AVX2 and everything before it.
             return match most < InstructionSet::Avx2 as u8 {
                 true => Arch::V2,
                 false => Arch::V3,

@@ -1,8 +1,8 @@
-//! Which splats touch which tiles, in depth order (3DGS section 6).
+//! Lists the splats that touch each tile, in depth order (3DGS section 6).
 //!
 //! The splats that a camera sees are numbered in the order of their Gaussians, so that memory is
-//! read and written one after the other. Each emits its tiles; a counting sort brings these
-//! together tile by tile, and each tile sorts its own few by (depth, index).
+//! accessed sequentially. Each splat emits its tiles; a counting sort groups these by tile, and
+//! each tile sorts its own few splats by (depth, index).
 
 mod by_tile;
 mod emit;
@@ -23,14 +23,13 @@ use by_tile::ByTile;
 use emit::{Emission, Emitted, emit};
 use splat_core::memory::{in_units, lacking};
 
-/// Gaussians per unit of the search for those that are seen.
+/// Gaussians per unit of parallel work in the visibility search.
 const SEARCHED: usize = 2048;
 
-/// Intersections of one camera that can be listed: they are counted in 32 bits.
+/// Most intersections per camera, since they are counted in 32 bits.
 const MAX_INTERSECTIONS: u64 = u32::MAX as u64;
 
-/// The one place that decides how many intersections are too many. Asked before any list is
-/// allocated.
+/// Refuses too many intersections, before any list is allocated. No other place decides this.
 fn check_intersections(intersections: u64, limit: u64) -> Result<(), OpError> {
     if intersections <= limit {
         return Ok(());
@@ -42,8 +41,7 @@ fn check_intersections(intersections: u64, limit: u64) -> Result<(), OpError> {
     })
 }
 
-/// Refuses intersections that memory could not hold: the allocation that failed would end the
-/// process.
+/// Refuses intersections that would not fit into memory; a failed allocation would end the process.
 fn check_memory(intersections: u64, bytes_per_intersection: u64) -> Result<(), OpError> {
     let needed = intersections.saturating_mul(bytes_per_intersection);
     match lacking(needed) {
@@ -57,11 +55,9 @@ fn check_memory(intersections: u64, bytes_per_intersection: u64) -> Result<(), O
     }
 }
 
-/// Bytes that an intersection takes at most at any one time: while the lists are made, or then with
-/// the bytes `kept` of it.
+/// Peak bytes per intersection: while the lists are made, or afterwards with the `kept` bytes.
 fn bytes_per_intersection(kept: usize) -> u64 {
-    // Tiles of the emission, whose vectors grow by doubling; owners, intersections, splats and
-    // places.
+    // Emitted tiles, whose vectors grow by doubling; then owners, intersections, splats and places.
     let while_listed = (2 + 4) * size_of::<u32>();
     let listed = 2 * size_of::<u32>();
     while_listed.max(listed + kept) as u64
@@ -75,9 +71,8 @@ fn max_intersections() -> u64 {
 #[cfg(test)]
 use tests::max_intersections;
 
-/// The Gaussians among some that can be seen anywhere: not culled, not too faint, and no NaN
-/// decides it. One with a colour that is not finite is left out too: it would be in every pixel it
-/// touches.
+/// Gaussians that may be visible: not culled, not too faint, without NaN in the fields that decide
+/// it. Excludes Gaussians whose colour is not finite, which would spoil every pixel they touch.
 fn visible<T: Real>(
     gaussians: Range<usize>,
     [packed, colors, opacities]: [&[T]; 3],
@@ -94,7 +89,7 @@ fn visible<T: Real>(
     for n in gaussians {
         let (extent, opacity) = (packed[n * PROJECTED_WIDTH + PROJECTED_EXTENT], opacities[n]);
         let is_seen = (extent > T::ZERO) & (opacity >= alpha_min) & opacity.is_finite();
-        // Written in any case: whether it counts would be guessed wrongly as often as not.
+        // Written unconditionally: the branch would be mispredicted about half of the time.
         visible[count] = n as u32;
         count += usize::from(is_seen & (all_are || are_finite(n..n + 1)));
     }
@@ -107,19 +102,19 @@ fn visible<T: Real>(
 pub(super) struct TileLists {
     /// The Gaussian of each listed splat, ascending.
     pub(super) listed: Vec<u32>,
-    /// The emitted intersections of each listed splat end here.
+    /// End of the emitted intersections of each listed splat.
     ends: Vec<u32>,
-    /// Where each emitted intersection went when they were sorted by tile and depth.
+    /// Sorted position of each emitted intersection, by tile and depth.
     places: Vec<AtomicU32>,
-    /// The listed splat of each intersection, sorted by tile, front to back in each tile.
+    /// Listed splat of each intersection, sorted by tile, and front to back within a tile.
     splats: Vec<u32>,
-    /// `tiles[t]..tiles[t + 1]`: the sorted intersections of tile t, tiles in rows.
+    /// `tiles[t]..tiles[t + 1]`: the sorted intersections of tile t; tiles are in row-major order.
     tiles: Vec<u32>,
 }
 
 impl TileLists {
-    /// Lists for one camera, and its listed splats: packed splats `[N, 9]`, colours `[N, D]` and
-    /// opacities `[N]`. Of each intersection the caller keeps `kept` bytes.
+    /// Builds the lists of one camera and its listed splats from packed splats `[N, 9]`, colours
+    /// `[N, D]` and opacities `[N]`. The caller keeps `kept` bytes per intersection.
     pub(super) fn new<T: Real>(
         [packed, colors, opacities]: [&[T]; 3],
         args: &RasterizeArgs,
@@ -151,7 +146,7 @@ impl TileLists {
                 })
                 .collect()
         };
-        // Where there may be too many they are counted before any is kept.
+        // If there may be too many, count them before keeping any.
         let limit = max_intersections();
         let each = bytes_per_intersection(kept);
         let most = listed.len() as u64 * grid.tiles() as u64;
@@ -171,25 +166,25 @@ impl TileLists {
         self.splats.len()
     }
 
-    /// The splats of a tile, front to back.
+    /// Splats of a tile, front to back.
     pub(super) fn tile(&self, tile: usize) -> &[u32] {
         &self.splats[self.tiles[tile] as usize..self.tiles[tile + 1] as usize]
     }
 
-    /// The sorted intersections of a row of tiles.
+    /// Sorted intersections of a row of tiles.
     pub(super) fn row_of_tiles(&self, ty: usize, grid: Grid) -> Range<usize> {
         let [first, last] = [ty, ty + 1].map(|row| self.tiles[row * grid.columns] as usize);
         first..last
     }
 
-    /// The emitted intersections of a listed splat.
+    /// Emitted intersections of a listed splat.
     #[inline(always)]
     pub(super) fn emitted(&self, splat: usize) -> Range<usize> {
         let first = splat.checked_sub(1).map_or(0, |before| self.ends[before]);
         first as usize..self.ends[splat] as usize
     }
 
-    /// Where an emitted intersection went, if there is one of that number.
+    /// Sorted position of an emitted intersection, if it exists.
     #[inline(always)]
     pub(super) fn place(&self, emitted: usize) -> Option<usize> {
         let place = self.places.get(emitted)?;
@@ -209,7 +204,7 @@ mod tests {
     use burn::tensor::{Device, Tensor, TensorData};
 
     thread_local! {
-        /// A test on this thread may lower the limit: no test can list 2^32 intersections.
+        /// Lets a test lower the limit on its thread; no test can list 2^32 intersections.
         static LIMIT: Cell<u64> = const { Cell::new(MAX_INTERSECTIONS) };
     }
 
@@ -330,7 +325,7 @@ mod tests {
                 }) => intersections,
                 other => panic!("{other:?}"),
             };
-            // Fewer than the nine tiles of the bounding box: what counts is what would be listed.
+            // Fewer than the nine tiles of the bounding box, as only listed tiles count.
             assert!(
                 (3..9).contains(&intersections),
                 "{intersections} intersections"

@@ -1,14 +1,14 @@
-//! Small vectors and matrices, in rows.
+//! Small vectors and row-major matrices.
 //!
-//! For loops that are to become SIMD code: no branch, and no array method that takes a closure
-//! (`map`, `from_fn`), whose inner functions the compiler may leave in another unit, as calls.
+//! For loops meant to become SIMD code: no branches, and no array methods that take closures
+//! (`map`, `from_fn`), which the compiler may leave as calls into another codegen unit.
 
 use super::real::Real;
 
 pub(super) type Vec3<T> = [T; 3];
 /// Rows.
 pub(super) type Mat3<T> = [[T; 3]; 3];
-/// Two rows.
+/// Two rows of three.
 pub(super) type Mat23<T> = [[T; 3]; 2];
 
 #[inline(always)]
@@ -41,7 +41,7 @@ pub(super) fn largest<T: Real>(a: Vec3<T>) -> T {
     a[0].abs().greatest(a[1].abs()).greatest(a[2].abs())
 }
 
-/// `a / s`; zero where s is.
+/// `a / s`, or zero if s is zero.
 #[inline(always)]
 pub(super) fn over<T: Real>(a: Vec3<T>, s: T) -> Vec3<T> {
     if s == T::ZERO {
@@ -63,7 +63,7 @@ pub(super) fn apply<T: Real>(m: &Mat3<T>, v: Vec3<T>) -> Vec3<T> {
     [dot(m[0], v), dot(m[1], v), dot(m[2], v)]
 }
 
-/// `v^T M`, that is `M^T v`.
+/// `v^T M`, which is `M^T v`.
 #[inline(always)]
 pub(super) fn apply_transposed<T: Real>(m: &Mat3<T>, v: Vec3<T>) -> Vec3<T> {
     add(add(scale(m[0], v[0]), scale(m[1], v[1])), scale(m[2], v[2]))
@@ -80,9 +80,9 @@ pub(super) fn add3<T: Real>(a: &Mat3<T>, b: &Mat3<T>) -> Mat3<T> {
     [add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2])]
 }
 
-/// Unit quaternion (w, x, y, z), the length it had, and whether it had one and is finite; what is
-/// returned otherwise has no meaning. Scaled by the largest entry first, so that neither tiny nor
-/// huge ones under- or overflow.
+/// Unit quaternion (w, x, y, z), the original length, and whether the input was finite and of
+/// non-zero length; otherwise the results are meaningless. Divides by the largest entry first, so
+/// that tiny and huge inputs neither underflow nor overflow.
 #[inline(always)]
 pub(super) fn normalize_quat<T: Real>(q: [T; 4]) -> ([T; 4], T, bool) {
     let mut largest = T::ZERO;
@@ -125,8 +125,8 @@ pub(super) fn rotation<T: Real>([w, x, y, z]: [T; 4]) -> Mat3<T> {
     ]
 }
 
-/// Gradient of the quaternion as it was before normalisation, given the gradient `g` of its
-/// rotation matrix. Orthogonal to the quaternion.
+/// Gradient of the quaternion before normalisation, from the gradient `g` of its rotation matrix.
+/// Orthogonal to the quaternion.
 #[inline(always)]
 pub(super) fn rotation_backward<T: Real>(unit: [T; 4], length: T, g: &Mat3<T>) -> [T; 4] {
     let [w, x, y, z] = unit;

@@ -1,10 +1,9 @@
 //! Native Rust for Burn's Flex backend: f32, and f64 as the reference.
 //!
-//! Parallel over Gaussians or rows of tiles with rayon, and deterministic: whatever is summed
-//! across threads is summed in a fixed order, so the same input gives the same bits on any number
-//! of threads.
+//! Runs in parallel over Gaussians or rows of tiles with rayon. Deterministic: sums across threads
+//! have a fixed order, so the same input gives the same bits on any number of threads.
 
-/// Runs a generic function in the precision of a tensor. The public ops let only F32 and F64 pass.
+/// Calls a generic function in the precision of a tensor. The public ops accept only F32 and F64.
 macro_rules! in_precision {
     ($tensor:expr, $function:path, $($argument:expr),* $(,)?) => {
         match $tensor.dtype() {

@@ -2,7 +2,7 @@
 
 use rayon::prelude::*;
 
-/// Memory for `len` values that are all written before any is read. Tests fill it with NaN first.
+/// Memory for `len` values, all written before any is read. Tests fill it with NaN first.
 pub(crate) fn overwritten<T: Overwritten + bytemuck::Pod>(len: usize) -> Vec<T> {
     #[cfg(test)]
     if super::poison::is_on() {
@@ -11,8 +11,7 @@ pub(crate) fn overwritten<T: Overwritten + bytemuck::Pod>(len: usize) -> Vec<T> 
     zeros(len)
 }
 
-/// Zeros, written by all threads where they are many: a step asks for more than one thread clears
-/// in the meantime.
+/// Zeros. Large buffers are cleared by all threads, as one thread would be too slow within a step.
 pub(crate) fn zeros<T: Overwritten + bytemuck::Pod>(len: usize) -> Vec<T> {
     const BLOCK: usize = 1024;
     if len < 64 * BLOCK {
@@ -25,11 +24,11 @@ pub(crate) fn zeros<T: Overwritten + bytemuck::Pod>(len: usize) -> Vec<T> {
     values
 }
 
-/// Value of [`overwritten`] memory before it is written.
+/// Contents of [`overwritten`] memory before it is written.
 pub(crate) trait Overwritten: Copy + Send + Sync {
     /// Zero.
     const CLEAR: Self;
-    /// NaN, or for an index one far outside of any list.
+    /// NaN, or for indices a value far outside any list.
     #[cfg(test)]
     const POISON: Self;
 }

@@ -1,6 +1,5 @@
-//! Mean absolute difference and mean structural similarity of two pictures in one sweep over their
-//! rows, and with it the gradient of the similarity. The gradient of the loss is then one more
-//! pass.
+//! Mean absolute difference and mean structural similarity of two images in one sweep over their
+//! rows, with the gradient of the similarity. The gradient of the loss then takes one more pass.
 
 mod pictures;
 mod rows;
@@ -21,8 +20,8 @@ use crate::settings::SsimArgs;
 use pictures::{Pictures, spread};
 use sweep::{Scratch, Sweep};
 
-/// Rows per unit of parallel work. What lies under the window beyond a band is computed by both
-/// neighbours, which makes few rows dear; many leave nothing to share out at the end.
+/// Rows per unit of parallel work. Both neighbours compute the rows that the window reaches beyond
+/// a band, so small bands are expensive; large ones balance badly at the end.
 const BAND: RangeInclusive<usize> = 32..=128;
 
 impl PhotometricOps for Flex {
@@ -51,7 +50,7 @@ impl PhotometricBackend for Flex {
     }
 }
 
-/// The mean absolute difference, and one less the mean similarity: `[2]`.
+/// The mean absolute difference and one minus the mean similarity, `[2]`.
 fn measure<T: Real>(
     _: PhantomData<T>,
     rendered: FlexTensor,
@@ -61,7 +60,7 @@ fn measure<T: Real>(
     means::<T>(&Pictures::new(rendered, target), args, None)
 }
 
-/// The same, and the gradient of the mean similarity.
+/// [`measure`], with the gradient of the mean similarity.
 fn measure_tracked<T: Real>(
     _: PhantomData<T>,
     rendered: FlexTensor,
@@ -82,7 +81,7 @@ fn means<T: Real>(
     let [b, h, w, d] = pictures.shape;
     let sweep = Sweep::<T>::new(pictures, args);
     let band = rows_of_band(b * h);
-    // By row, and so the same however many bands there are.
+    // Sums per row, so that the result does not depend on the number of bands.
     let mut sums = vec![[0.0; 2]; b * h];
     let mut bands: Vec<Band<T>> = sums
         .chunks_mut(h.max(1))
@@ -105,7 +104,7 @@ fn means<T: Real>(
     }
     bands
         .into_par_iter()
-        // Or else the last bands would often be worked on by one thread alone.
+        // Without this the last bands would often be left to one thread.
         .with_max_len(1)
         .for_each_init(Scratch::default, |scratch, band| {
             let slope = band.slope.map(Part::overwritten);
@@ -119,13 +118,13 @@ fn means<T: Real>(
     tensor(vec![T::of(l1), T::of(1.0 - ssim)], [2])
 }
 
-/// Two bands for each thread if they are neither too small nor too large.
+/// Two bands per thread, within the limits of the band size.
 fn rows_of_band(rows: usize) -> usize {
     let even = rows.div_ceil(2 * rayon::current_num_threads());
     even.next_multiple_of(2).clamp(*BAND.start(), *BAND.end())
 }
 
-/// Rows of one image: their sums, and where the gradient of the similarity goes, if anywhere.
+/// Rows of one image: their sums, and the memory for the gradient of the similarity, if wanted.
 struct Band<'a, T> {
     image: usize,
     first: usize,
@@ -133,7 +132,7 @@ struct Band<'a, T> {
     slope: Option<Part<'a, T>>,
 }
 
-/// Gradient of `rendered`, given that of the means and what [`measure_tracked`] left.
+/// Gradient of `rendered`, from the gradient of the means and the results of [`measure_tracked`].
 fn backward<T: Real>(
     _: PhantomData<T>,
     rendered: FlexTensor,

@@ -1,10 +1,10 @@
-//! A switch of tests: whether memory that is to be overwritten is full of NaN before.
+//! Test switch: fills memory that is about to be overwritten with NaN.
 
 use core::sync::atomic::{AtomicBool, Ordering};
 
 static POISON: AtomicBool = AtomicBool::new(false);
 
-/// For the whole process.
+/// Applies to the whole process.
 pub(crate) fn poison(on: bool) {
     POISON.store(on, Ordering::Relaxed);
 }

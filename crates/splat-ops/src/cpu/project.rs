@@ -1,6 +1,6 @@
 //! Projection of Gaussians to screen splats, and its gradient.
 //!
-//! With p = W mean + t = (x, y, z) in the camera and u = x/z, v = y/z clamped near the view:
+//! With p = W mean + t = (x, y, z) in camera space, and u = x/z, v = y/z clamped near the view:
 //!
 //! ```text
 //! J = | fx/z   0    -fx u/z |      V = (J W R) diag(s), rows V1, V2
@@ -13,8 +13,8 @@
 //! ```
 //!
 //! `a c - b b` would lose the determinant of a needle in single precision; the minors keep it. V
-//! and e are taken in units of the splat's own size (`k` pixels), so that nothing over- or
-//! underflows, be the splat a millionth of a pixel or a million pictures wide.
+//! and e are in units of the splat's own size (`k` pixels), so that nothing overflows or
+//! underflows, whether the splat is a millionth of a pixel or a million images wide.
 
 mod camera;
 mod gradient;
@@ -42,11 +42,11 @@ use crate::settings::ProjectArgs;
 
 /// Gaussians per unit of parallel work. Fixed, so that sums over Gaussians have a fixed order.
 const CHUNK: usize = 512;
-/// Columns of a Gaussian in lanes: mean, quaternion, scales.
+/// Columns of a Gaussian: mean, quaternion, scales.
 const GAUSSIAN: usize = 10;
 /// Columns of a splat that carry a gradient: all but the extents.
 const GRADED: usize = 7;
-/// Columns of a camera's gradient in lanes: W, t, then fx, fy, cx, cy.
+/// Columns of a camera's gradient: W, t, then fx, fy, cx, cy.
 const CAMERA: usize = 16;
 
 /// The five inputs.
@@ -77,15 +77,15 @@ impl<'a, T: Real> Inputs<'a, T> {
         self.means.len() / 3
     }
 
-    /// Up to [`LANES`] Gaussians in columns. Lanes beyond them hold a quaternion of length zero:
-    /// culled.
+    /// Loads up to [`LANES`] Gaussians as columns. Unused lanes hold a quaternion of length zero,
+    /// which is culled.
     fn load(&self, rows: impl Iterator<Item = usize>) -> [Lanes<T>; GAUSSIAN] {
         let mut columns = [[T::ZERO; LANES]; GAUSSIAN];
         for (lane, n) in rows.enumerate() {
             let mean = &self.means[3 * n..3 * n + 3];
             let quat = &self.quats[4 * n..4 * n + 4];
             let scale = &self.scales[3 * n..3 * n + 3];
-            // One after the other, without a loop over chained parts.
+            // One part after the other; a loop over chained parts is slower.
             for (column, value) in columns[..3].iter_mut().zip(mean) {
                 column[lane % LANES] = *value;
             }
@@ -111,7 +111,7 @@ fn gaussian<T: Real>(columns: &[Lanes<T>; GAUSSIAN], lane: usize) -> Gaussian<T>
 }
 
 vectorized! {
-    /// The packed columns of a block of splats; zero where culled.
+    /// Packed columns of a block of splats; zero if culled.
     fn project_lanes<T: Real, const FMA: bool>(
         gaussians: &[Lanes<T>; GAUSSIAN],
         camera: &Camera<T>,
@@ -179,8 +179,8 @@ fn forward<T: Real>(
 }
 
 vectorized! {
-    /// Gradients of a block of Gaussians in one camera, and what they add to those of the camera,
-    /// if anybody wants them; nothing where culled.
+    /// Gradients of a block of Gaussians in one camera, and their contribution to the camera's
+    /// gradient, if wanted; zero if culled.
     fn project_lanes_backward<T: Real, const FMA: bool>(
         gaussians: &[Lanes<T>; GAUSSIAN],
         camera: &Camera<T>,
@@ -237,21 +237,21 @@ fn lanes_backward<T: Real, const OF_CAMERA: bool>(
     }
 }
 
-/// The gradients of one chunk of Gaussians, where they belong.
+/// Gradients of one chunk of Gaussians, in the output.
 struct Chunk<'a, T> {
     rows: Range<usize>,
     means: &'a mut [T],
     quats: &'a mut [T],
     scales: &'a mut [T],
-    /// Whether the cameras' are wanted too.
+    /// True if gradients of the cameras are wanted too.
     of_cameras: bool,
 }
 
 impl<T: Real> Chunk<'_, T> {
-    /// Adds the gradients through one camera; returns the camera's.
+    /// Adds the gradients through one camera; returns the camera's gradient.
     fn add(&mut self, inputs: &Inputs<T>, camera: &Camera<T>, grad: &[T]) -> [T; CAMERA] {
         let mut of_camera = [[T::ZERO; LANES]; CAMERA];
-        // Most splats of most views have none: culled, covered, or too faint.
+        // Most splats of most views have no gradient: culled, covered or too faint.
         let is_graded = |row: usize| {
             let graded = &grad[row * PROJECTED_WIDTH..][..GRADED];
             graded.iter().fold(false, |any, g| any | (*g != T::ZERO))

@@ -13,7 +13,8 @@ use splat_core::exp::{
 
 use super::overwritten::Overwritten;
 
-/// f32 or f64. Only what the ops need; every method is inlined so that loops over lanes vectorise.
+/// f32 or f64, with the operations that the ops need. Every method is inlined, so that loops over
+/// lanes vectorise.
 pub(crate) trait Real:
     Element
     + Overwritten
@@ -45,37 +46,34 @@ pub(crate) trait Real:
     /// Type of [`sort_key`](Self::sort_key).
     type SortKey: Ord + Copy + Send + Sync;
 
-    /// An integer that sorts as the number does (negative ones too), and equal numbers as `index`
-    /// does.
+    /// Integer key that orders numbers (negative ones too), with ties ordered by `index`.
     fn sort_key(self, index: u32) -> Self::SortKey;
     /// The index in a key.
     fn index_of(key: Self::SortKey) -> u32;
-    /// The nearest integer, ties to even, of a number from 0 to a million.
+    /// Nearest integer, ties to even, of a number from 0 to a million.
     fn nearest(self) -> i32;
-    /// The nearest value of this precision.
+    /// Nearest value of this precision.
     fn of(value: f64) -> Self;
-    /// Widened, or unchanged.
+    /// Value in double precision.
     fn wide(self) -> f64;
     /// `level / 255`.
     fn of_level(level: u8) -> Self;
     /// A whole number below 2^24.
     fn of_index(index: i32) -> Self;
     fn sqrt(self) -> Self;
-    /// The natural logarithm of a normal number above zero, to 3e-7 of itself or of one, whichever
-    /// is more.
+    /// Natural logarithm of a positive normal number, with an absolute or relative error of 3e-7.
     fn ln(self) -> Self;
     fn abs(self) -> Self;
     fn is_finite(self) -> bool;
-    /// `a b + c`, in one rounding where `FMA` says that this is one instruction.
+    /// `a b + c`, rounded once if `FMA` says that this is one instruction.
     fn multiply_add<const FMA: bool>(a: Self, b: Self, c: Self) -> Self;
-    /// `2^-t` for `t >= 0`, of several registers; anything under 1e-30 may come out as any such
-    /// value.
+    /// `2^-t` for `t >= 0`, for several registers; results below 1e-30 are only approximate.
     fn exp2_neg<S: Simd>(t: &mut [Vector<S, Self>]);
 
     /// `exp(x)`, to 2 units in the last place.
     fn exp<const FMA: bool>(x: Self) -> Self;
 
-    /// Rows to columns.
+    /// Transposes rows to columns.
     #[inline(always)]
     fn transposed(rows: [[Self; 4]; 4]) -> [[Self; 4]; 4] {
         core::array::from_fn(|i| core::array::from_fn(|j| rows[j][i]))
@@ -87,13 +85,13 @@ pub(crate) trait Real:
         core::array::from_fn(|i| a[i] + b[i])
     }
 
-    /// The lesser one; the second if the first is NaN.
+    /// The smaller one; the second if the first is NaN.
     #[inline(always)]
     fn least(self, other: Self) -> Self {
         if self < other { self } else { other }
     }
 
-    /// The greater one; the second if the first is NaN.
+    /// The larger one; the second if the first is NaN.
     #[inline(always)]
     fn greatest(self, other: Self) -> Self {
         if self > other { self } else { other }
@@ -184,7 +182,7 @@ impl Real for f32 {
     }
     #[inline(always)]
     fn nearest(self) -> i32 {
-        // Casts saturate, which takes a branch.
+        // Saturating casts would take a branch.
         ((self + ROUND).to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32)
     }
 
@@ -228,13 +226,13 @@ impl Real for f32 {
     fn exp2_neg<S: Simd>(t: &mut [Vector<S, f32>]) {
         exp2_neg_f32(t);
     }
-    // The compiler makes sixteen moves of the loop.
+    // The compiler would turn the loop into sixteen moves.
     #[cfg(target_arch = "x86_64")]
     #[inline(always)]
     fn transposed(rows: [[f32; 4]; 4]) -> [[f32; 4]; 4] {
         use core::arch::x86_64::{_mm_movehl_ps, _mm_movelh_ps, _mm_unpackhi_ps, _mm_unpacklo_ps};
         let [a, b, c, d] = bytemuck::cast(rows);
-        // SAFETY: every 64-bit x86 processor has these.
+        // SAFETY: every 64-bit x86 processor supports these instructions.
         let columns = unsafe {
             let (low, high) = (_mm_unpacklo_ps(a, b), _mm_unpackhi_ps(a, b));
             let (low_cd, high_cd) = (_mm_unpacklo_ps(c, d), _mm_unpackhi_ps(c, d));
@@ -247,12 +245,12 @@ impl Real for f32 {
         };
         bytemuck::cast(columns)
     }
-    // The compiler would take the four apart, to join them again in another way.
+    // The compiler would take the four apart and join them again differently.
     #[cfg(target_arch = "x86_64")]
     #[inline(always)]
     fn sums(a: [f32; 4], b: [f32; 4]) -> [f32; 4] {
         use core::arch::x86_64::_mm_add_ps;
-        // SAFETY: every 64-bit x86 processor has it.
+        // SAFETY: every 64-bit x86 processor supports the instruction.
         bytemuck::cast(unsafe { _mm_add_ps(bytemuck::cast(a), bytemuck::cast(b)) })
     }
     #[inline(always)]
@@ -263,12 +261,12 @@ impl Real for f32 {
 
 /// `2^-t` as `2^n 2^-g` with `|g| <= 1/2`: g is exact, and a polynomial stands for `2^-g`. Against
 /// f64 on [0, 24]: relative error below 2e-7 (see the test), fused or not.
-// Step by step for all registers: what follows in one waits for what came before, and a processor
-// looks only so far ahead for something else to do.
+// One step for all registers before the next: each step depends on the one before, and the
+// processor looks only so far ahead for independent work.
 #[inline(always)]
 fn exp2_neg_f32<S: Simd>(t: &mut [Vector<S, f32>]) {
     let zero = 0f32.splat();
-    // As many as there may be.
+    // As many as there can be.
     let (mut shifted, mut g): ([Vector<S, f32>; 16], _) = ([zero; 16], [zero; 16]);
     let mut power: [Vector<S, f32>; 16] = [EXP2[0].splat(); 16];
     let count = t.len();
@@ -296,7 +294,7 @@ fn exp2_neg_f32<S: Simd>(t: &mut [Vector<S, f32>]) {
     }
 }
 
-/// By Horner's rule, coefficients from the highest degree down.
+/// Horner's rule; coefficients from the highest degree down.
 #[inline(always)]
 fn polynomial<const FMA: bool>([c5, rest @ ..]: &[f32; 6], x: f32) -> f32 {
     let mut sum = *c5;
@@ -306,10 +304,10 @@ fn polynomial<const FMA: bool>([c5, rest @ ..]: &[f32; 6], x: f32) -> f32 {
     sum
 }
 
-/// `exp(x) = 2^n e^r` for any x: infinite and zero where that is out of range, NaN for NaN.
+/// `exp(x) = 2^n e^r` for any x: infinity and zero out of range, NaN for NaN.
 #[inline(always)]
 fn exp_f32<const FMA: bool>(x: f32) -> f32 {
-    // ln(2) in two parts; the first has so few bits that n * LN2_HIGH is exact.
+    // ln(2) in two parts; the first has few enough bits that n * LN2_HIGH is exact.
     const LN2_HIGH: f32 = EXP_LN2_HIGH as f32 / 512.0;
     const LN2_LOW: f32 = EXP_LN2_LOW;
     let multiply_add = f32::multiply_add::<FMA>;
@@ -321,8 +319,7 @@ fn exp_f32<const FMA: bool>(x: f32) -> f32 {
     let n = shifted - ROUND;
     let r = multiply_add(-n, LN2_LOW, multiply_add(-n, LN2_HIGH, x));
     let p = polynomial::<FMA>(&EXP, r);
-    // n may be 128, or -150: neither is the exponent of a normal number, but those of its halves
-    // are.
+    // n may be 128 or -150, which are no exponents of normal numbers; their halves are.
     let n = (shifted.to_bits() as i32).wrapping_sub(ROUND.to_bits() as i32);
     let half = n >> 1;
     p * two_to(half) * two_to(n.wrapping_sub(half))
@@ -341,13 +338,13 @@ fn ln_f32(x: f32) -> f32 {
     n as f32 * core::f32::consts::LN_2 + s * series
 }
 
-/// `2^n` of a small n: moved into the exponent.
+/// `2^n` for a small n, built from its exponent bits.
 #[inline(always)]
 fn two_to(n: i32) -> f32 {
     f32::from_bits(((n << 23) as u32).wrapping_add(1.0f32.to_bits()))
 }
 
-/// [`Real::exp2_neg`] of one number, for tests; `FMA`: with fused products and sums.
+/// [`Real::exp2_neg`] of one number, for tests. `FMA` selects fused multiply-add.
 #[cfg(test)]
 pub(crate) fn exp2_neg_of_one<const FMA: bool>(t: f32) -> f32 {
     let t = t.least(115.0);
@@ -393,7 +390,7 @@ mod tests {
         assert_eq!(f64::transposed(wide), columns.map(|row| row.map(f64::from)));
     }
 
-    /// The steps one by one, with fused products and sums and without.
+    /// Each step, with fused multiply-add and without.
     #[test]
     fn exp_in_registers_is_that_of_one() {
         let mut values: Vec<f32> = (0..1 << 18).map(|i| i as f32 * 1e-4).collect();
@@ -415,7 +412,7 @@ mod tests {
         }
         println!("fused: {FMA}, worst relative error {worst:e}");
         assert!(worst < 2e-7, "worst relative error {worst:e}");
-        // Numbers below the normal ones have fewer digits, and then none.
+        // Subnormal numbers have fewer digits, and finally none.
         for x in [
             -88.0f32,
             -95.0,

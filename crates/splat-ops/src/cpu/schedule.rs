@@ -1,11 +1,11 @@
-//! Who works on what, where the pieces of some work differ.
+//! Scheduling of uneven work.
 
 use core::cmp::Reverse;
 
 use rayon::prelude::*;
 
-/// Runs pieces of work on all threads, the heaviest first, each taken by the thread that is free:
-/// so that the threads end together. Returns the results in the order of the pieces.
+/// Runs pieces of work on all threads, heaviest first; each idle thread takes the next piece, so
+/// that all threads finish together. Returns the results in the order of the pieces.
 pub(super) fn heaviest_first<P: Send, R: Send>(
     pieces: impl IntoIterator<Item = P>,
     work: impl Fn(usize) -> usize,

@@ -1,7 +1,7 @@
-//! Colours in the directions of the cameras, `max(SH(mean - centre) + 0.5, 0)`, and their gradient.
+//! View-dependent colours, `max(SH(mean - centre) + 0.5, 0)`, and their gradient.
 //!
-//! Directions and basis functions are the same arithmetic for every Gaussian: in columns, as SIMD
-//! code. Coefficients lie in rows, and are read and written there.
+//! Directions and basis functions are the same arithmetic for every Gaussian, so they are computed
+//! in columns, as SIMD code. Coefficients are stored in rows, and read and written there.
 
 use core::marker::PhantomData;
 
@@ -57,7 +57,7 @@ impl<'a, T: Real> Inputs<'a, T> {
         self.means.len() / 3
     }
 
-    /// The centre of a camera, and whether it sees a Gaussian, by its index.
+    /// Centre of a camera, and a function that tells whether the camera sees a Gaussian.
     fn camera(&self, camera: usize) -> (&'a [T], impl Fn(usize) -> bool + 'a) {
         let packed = self.seen.map(|seen| {
             let width = self.count() * PROJECTED_WIDTH;
@@ -69,8 +69,8 @@ impl<'a, T: Real> Inputs<'a, T> {
         (&self.centers[3 * camera..3 * camera + 3], is_seen)
     }
 
-    /// Some coefficients of one Gaussian, from the one after the first; each with the number that
-    /// follows it in memory, or zero, as four numbers are read at once.
+    /// Coefficients of one Gaussian, starting after the first. Each is read as four numbers: its
+    /// three channels, and the next number in memory or zero.
     #[inline(always)]
     fn rest<const REST: usize>(&self, n: usize) -> [[T; 4]; REST] {
         let row = &self.rest[3 * self.stored * n..][..3 * REST];
@@ -90,7 +90,7 @@ impl<'a, T: Real> Inputs<'a, T> {
         &self.sh0[3 * n..3 * n + 3]
     }
 
-    /// Means of up to [`LANES`] Gaussians, seen from a centre.
+    /// Means of up to [`LANES`] Gaussians relative to a centre.
     fn directions(&self, rows: impl Iterator<Item = usize>, center: &[T]) -> [Lanes<T>; 3] {
         let mut columns = [[T::ZERO; LANES]; 3];
         for (lane, n) in rows.enumerate() {
@@ -102,9 +102,9 @@ impl<'a, T: Real> Inputs<'a, T> {
         columns
     }
 
-    /// The colours of some Gaussians before the clamp, given the basis in their directions.
-    // Four numbers each, of which one means nothing: written to memory, all of them have to be
-    // computed, side by side.
+    /// Colours of some Gaussians before the clamp, from the basis in their directions.
+    // Four numbers each, of which the last is meaningless: storing all four keeps the computation
+    // in SIMD.
     #[inline(always)]
     fn colors<const REST: usize>(
         &self,
@@ -129,8 +129,8 @@ impl<'a, T: Real> Inputs<'a, T> {
     }
 }
 
-/// Calls a function for the number of coefficients beyond the first that the degree reads, which
-/// the compiler then knows: `function::<.., COUNT>(...)`.
+/// Calls `function::<.., COUNT>(...)` with the number of coefficients beyond the first that the
+/// degree reads, as a compile-time constant.
 macro_rules! by_degree {
     ($degree:expr, $function:ident::<$($generic:ident),+>($($argument:expr),* $(,)?)) => {
         match $degree {
@@ -145,8 +145,8 @@ macro_rules! by_degree {
 mod backward;
 
 vectorized! {
-    /// Writes the colours of some Gaussians to where they lie behind that of the `first`, given the
-    /// basis in their directions.
+    /// Writes the colours of some Gaussians, relative to the `first`, from the basis in their
+    /// directions.
     fn colors_of_rows<T: Real, const FMA: bool>(
         inputs: &Inputs<T>,
         rows: &[usize],
@@ -170,21 +170,21 @@ fn colors_of_degree<T: Real, const REST: usize>(
     for (row, values) in rows.iter().zip(values) {
         let out = &mut colors[3 * (row - first)..][..3];
         for (out, value) in out.iter_mut().zip(values) {
-            // NaN stays.
+            // Keeps NaN.
             *out = if value < T::ZERO { T::ZERO } else { value };
         }
     }
 }
 
 vectorized! {
-    /// Unit directions and one over their lengths, and the basis functions in them.
+    /// Unit directions, the inverse of their lengths, and the basis functions in them.
     fn evaluate<T: Real, const FMA: bool>(
         degree: usize,
         directions: &[Lanes<T>; 3],
         units: &mut [Lanes<T>; 4],
         values: &mut [Lanes<T>; COUNT_MAX],
     ) {
-        // One loop per degree, without a branch in it.
+        // One branch-free loop per degree.
         match degree {
             0 => evaluate_degree::<T, 0>(directions, units, values),
             1 => evaluate_degree::<T, 1>(directions, units, values),

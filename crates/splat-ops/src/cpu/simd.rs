@@ -1,14 +1,13 @@
-//! Code for the processor at hand: chosen at run time, so that one binary runs everywhere.
+//! Code for the running processor, chosen at run time, so that one binary runs everywhere.
 
 use core::ops::Range;
 
-/// Defines a function whose body is compiled for the baseline, for AVX2 with FMA and for AVX-512,
-/// and which takes the best that the processor can run. What the body calls must be
-/// `#[inline(always)]`, or it stays compiled for the baseline.
+/// Defines a function whose body is compiled for the baseline, for AVX2 with FMA, and for AVX-512,
+/// and which runs the best version that the processor supports. Functions called by the body must
+/// be `#[inline(always)]`, or they stay compiled for the baseline.
 ///
-/// `FMA` tells the body whether fused products and sums are instructions (they are calls
-/// otherwise). Rust never fuses by itself: where the body does not ask for it, the numbers are the
-/// same either way.
+/// `FMA` tells the body whether fused multiply-add is an instruction (otherwise it is a call). Rust
+/// never fuses by itself: unless the body asks for it, the results are the same either way.
 macro_rules! vectorized {
     (
         $(#[$meta:meta])*
@@ -25,20 +24,20 @@ macro_rules! vectorized {
                 fn avx2<T: Real>($($argument: $type),*) $(-> $result)? {
                     body::<T, true>($($argument),*)
                 }
-                // Twice the registers, so that constants stay in them, and masks.
+                // Twice as many registers, so that constants stay in them; and masks.
                 #[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512dq,avx512vl")]
                 fn avx512<T: Real>($($argument: $type),*) $(-> $result)? {
                     body::<T, true>($($argument),*)
                 }
                 match $crate::cpu::InstructionSet::chosen() {
-                    // SAFETY: these are the features that `chosen` asks the processor for.
+                    // SAFETY: `chosen` has checked that the processor has these features.
                     $crate::cpu::InstructionSet::Avx512 => return unsafe { avx512($($argument),*) },
                     // SAFETY: as above.
                     $crate::cpu::InstructionSet::Avx2 => return unsafe { avx2($($argument),*) },
                     _ => {}
                 }
             }
-            // Every 64-bit Arm processor fuses.
+            // Every 64-bit Arm processor has fused multiply-add.
             body::<T, { cfg!(any(target_arch = "aarch64", target_feature = "fma")) }>($($argument),*)
         }
     };
@@ -46,19 +45,19 @@ macro_rules! vectorized {
 
 pub(super) use vectorized;
 
-/// Begins to bring some items, as far as there are any, to the processor's cache.
+/// Prefetches a range of items, as far as they exist, into the cache.
 #[inline(always)]
 pub(super) fn prefetch<V>(items: &[V], range: Range<usize>) {
     #[cfg(target_arch = "x86_64")]
     if let Some(items) = items.get(range.start..range.end.min(items.len())) {
         use core::arch::x86_64::{_MM_HINT_T0, _mm_prefetch};
-        /// Bytes of a line of the cache.
+        /// Bytes of a cache line.
         const LINE: usize = 64;
         let (start, bytes) = (items.as_ptr().cast::<i8>(), size_of_val(items));
-        // Where lines begin elsewhere, the last one may hold a little more.
+        // If items are not aligned to lines, the last line may hold a little more.
         let last = (align_of::<V>() < LINE).then_some(bytes.saturating_sub(1));
         for byte in (0..bytes).step_by(LINE).chain(last) {
-            // SAFETY: every 64-bit x86 processor has the instruction, which reads nothing.
+            // SAFETY: every 64-bit x86 processor supports the instruction, which reads nothing.
             unsafe { _mm_prefetch::<_MM_HINT_T0>(start.wrapping_add(byte)) }
         }
     }
@@ -66,15 +65,15 @@ pub(super) fn prefetch<V>(items: &[V], range: Range<usize>) {
     let _ = (items, range);
 }
 
-/// Rows that are worked on together. Large enough for any register, small enough for dozens of
-/// columns in the first-level cache.
+/// Rows processed together. Enough for any register width, and few enough for dozens of columns in
+/// the L1 cache.
 pub(super) const LANES: usize = 32;
 
-/// One number of each of [`LANES`] rows. A loop over lanes, without branches and calls, becomes
-/// SIMD code.
+/// One number for each of [`LANES`] rows. A loop over lanes without branches and calls becomes SIMD
+/// code.
 pub(super) type Lanes<T> = [T; LANES];
 
-/// Hands out those of the rows that `is_kept`, in order, up to [`LANES`] at a time.
+/// Passes on the rows that `is_kept`, in order, up to [`LANES`] at a time.
 pub(super) fn for_each_block(
     rows: Range<usize>,
     is_kept: impl Fn(usize) -> bool,

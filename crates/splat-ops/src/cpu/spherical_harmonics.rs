@@ -1,7 +1,7 @@
 //! Real spherical harmonics in the basis of 3DGS, and their gradient.
 //!
-//! Every basis function of degree l is written as a homogeneous polynomial of degree l in the unit
-//! direction, so that the zero vector has a well-defined value (zero beyond degree 0).
+//! Each basis function of degree l is a homogeneous polynomial of degree l in the unit direction,
+//! so that it is defined at the zero vector (zero beyond degree 0).
 
 use core::marker::PhantomData;
 
@@ -23,7 +23,7 @@ pub(super) const COUNT_MAX: usize = sh_coefficient_count(SH_DEGREE_MAX);
 /// Gaussians per unit of parallel work.
 const CHUNK: usize = 512;
 
-/// Values of the first `(degree + 1)^2` basis functions in a unit direction; the rest is zero.
+/// Values of the first `(degree + 1)^2` basis functions in a unit direction; the rest are zero.
 #[inline(always)]
 pub(super) fn basis<T: Real>(degree: usize, [x, y, z]: Vec3<T>) -> [T; COUNT_MAX] {
     let k = T::of;
@@ -106,7 +106,7 @@ pub(super) fn basis_gradient<T: Real>(degree: usize, [x, y, z]: Vec3<T>) -> [Vec
     d
 }
 
-/// Unit vector and one over the length; both zero for the zero vector.
+/// Unit vector and the inverse of the length; both zero for the zero vector.
 #[inline(always)]
 pub(super) fn normalize<T: Real>(v: Vec3<T>) -> (Vec3<T>, T) {
     let largest = largest(v);
@@ -176,16 +176,16 @@ fn forward<T: Real>(
     tensor(colors, [c, n, 3])
 }
 
-/// Nothing was seen of it: the rule for most splats of most views. Zero times NaN must not come out
-/// of one that is broken either; its gradient would reach the camera's.
+/// Tests whether a gradient is all zero, as for most splats of most views. Skipping those also
+/// keeps zero times NaN of a broken splat out of the camera's gradient.
 #[inline(always)]
 pub(super) fn is_zero<T: Real>(grad: &[T]) -> bool {
     grad.iter().all(|g| *g == T::ZERO)
 }
 
-/// `grad . coeff`, where a channel without gradient (black, and clamped there) does not look at its
-/// coefficient, which may be infinite.
-// Every product is computed, so that no branch is needed.
+/// `grad . coeff`, ignoring the coefficient, which may be infinite, of a channel without gradient
+/// (black, and clamped there).
+// Computes every product, to avoid branches.
 #[inline(always)]
 pub(super) fn guarded_dot<T: Real>(grad: Vec3<T>, coeff: Vec3<T>) -> T {
     let mut sum = T::ZERO;
@@ -210,8 +210,8 @@ fn backward<T: Real>(
     let (coeffs, dirs, grad) = (coeffs.slice::<T>(), dirs.slice::<T>(), grad.slice::<T>());
     let count = sh_coefficient_count(degree);
 
-    // color = sum_i B_i(d) coeff_i: a coefficient's gradient is B_i(d) times the colour's, summed
-    // over the cameras.
+    // color = sum_i B_i(d) coeff_i: the gradient of a coefficient is B_i(d) times that of the
+    // colour, summed over cameras.
     let grad_coeffs = needs_grad.coeffs.then(|| {
         let mut values = zeros::<T>(n * k * 3);
         values
@@ -236,7 +236,7 @@ fn backward<T: Real>(
         tensor(values, [n, k, 3])
     });
 
-    // d = v / |v|: the gradient of v is what is tangential, divided by |v|.
+    // d = v / |v|: the gradient of v is the tangential part, divided by |v|.
     let grad_dirs = needs_grad.dirs.then(|| {
         let mut values = overwritten::<T>(c * n * 3);
         values

@@ -1,21 +1,21 @@
-//! A splat as the inner loops want it: its ellipse, and what its alpha at a pixel takes.
+//! A splat in the form of the inner loops: its ellipse, and the numbers for its alpha at a pixel.
 
 use super::overwritten::Overwritten;
 use super::real::Real;
 
-/// The inverse Cholesky factor times this, squared, counts in powers of two: `2^-|z|^2 =
+/// Factor of the inverse Cholesky factor that makes exponents powers of two: `2^-|z|^2 =
 /// exp(-sigma)`. `sqrt(log2(e) / 2)`.
 pub(super) const UNIT: f64 = 0.849_321_800_288_019_1;
 
-/// How many numbers a splat has beside its colour.
+/// Numbers of a splat besides its colour.
 pub(super) const NUMBERS: usize = 11;
 
-/// Channels that are worked on at once.
+/// Channels processed at once.
 pub(super) const GROUP: usize = 4;
 
-/// A splat as the inner loops need it, in one line of the cache if in single precision. Its ellipse
-/// is the part of it that can pass the `alpha_min` test: `sigma <= cut`, cut being `ln(opacity /
-/// alpha_min)`, widened by a little so that rounding never drops a pixel.
+/// A splat in the form of the inner loops, in one cache line if in single precision. Its ellipse is
+/// the region that can pass the `alpha_min` test: `sigma <= cut` with cut = `ln(opacity /
+/// alpha_min)`, widened slightly so that rounding never drops a pixel.
 #[derive(Debug, Clone, Copy, Default)]
 #[repr(align(64))]
 pub(super) struct Splat<T> {
@@ -25,14 +25,14 @@ pub(super) struct Splat<T> {
     pub(super) w21: T,
     pub(super) w22: T,
     pub(super) opacity: T,
-    /// Along a row at dy the ellipse is `|dx - slope dy| <= sqrt(reach - shrink dy^2) inverse_a`.
+    /// Along a row at dy, the ellipse is `|dx - slope dy| <= sqrt(reach - shrink dy^2) inverse_a`.
     slope: T,
     reach: T,
     shrink: T,
     inverse_a: T,
-    /// The dy of the ellipse's right end; its left one lies opposite.
+    /// The dy of the ellipse's right end; the left end is opposite.
     end: T,
-    /// The first channels of its colour; zero where there are fewer.
+    /// First channels of the colour; zero if there are fewer.
     pub(super) color: [T; GROUP],
 }
 
@@ -79,7 +79,7 @@ impl<T: Copy> Splat<T> {
         }
     }
 
-    /// All but its colour.
+    /// Everything except the colour.
     #[inline(always)]
     pub(super) fn into_numbers(self) -> [T; NUMBERS] {
         let Self {
@@ -102,8 +102,8 @@ impl<T: Copy> Splat<T> {
 }
 
 impl<T: Real> Splat<T> {
-    /// From screen mean, inverse Cholesky factor and opacity, without a colour; and half the height
-    /// of its ellipse.
+    /// Builds a splat without a colour, and half the height of its ellipse, from screen mean,
+    /// inverse Cholesky factor and opacity.
     #[inline(always)]
     pub(super) fn new([x, y, w11, w21, w22, opacity]: [T; 6], alpha_min: T) -> (Self, T) {
         let cut = (opacity / alpha_min).ln();
@@ -128,8 +128,8 @@ impl<T: Real> Splat<T> {
         (splat, radius * a.sqrt() / (w11 * w22))
     }
 
-    /// Where between two rows the ellipse lies farthest right, or with a sign of -1 left, and
-    /// whether it lies there at all. All seen from its mean.
+    /// How far right (left with a sign of -1) the ellipse extends between two rows, and whether it
+    /// reaches them. Relative to the mean.
     #[inline(always)]
     pub(super) fn farthest(&self, sign: T, [first, last]: [T; 2]) -> (T, bool) {
         let dy = (sign * self.end).greatest(first).least(last);

@@ -1,4 +1,4 @@
-//! Structural similarity pixel by pixel, of tensor ops: training does not need it.
+//! Structural similarity per pixel, composed of tensor ops, as training does not need it.
 
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;

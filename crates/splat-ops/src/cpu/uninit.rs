@@ -1,6 +1,6 @@
-//! Memory that threads write in parts. Each part is cleared by the thread that writes it and just
-//! before, while it lies in that core's cache: all of it at once would go through the machine's
-//! memory once more.
+//! Memory that threads write in parts. The writing thread clears its part just before, while it
+//! lies in that core's cache; clearing everything at once would take another trip through main
+//! memory.
 
 use core::mem::MaybeUninit;
 use core::sync::atomic::{AtomicUsize, Ordering::Relaxed};
@@ -9,14 +9,14 @@ use super::overwritten::Overwritten;
 
 /// Memory whose parts are not cleared yet.
 pub(super) struct Uncleared<T> {
-    /// Empty, with room for all.
+    /// Empty, with capacity for all values.
     values: Vec<T>,
     length: usize,
-    /// How many values the parts handed out last have cleared.
+    /// Number of values that the current parts have cleared.
     cleared: AtomicUsize,
 }
 
-/// A part of it.
+/// A part of the memory.
 pub(super) struct Part<'a, T> {
     memory: &'a mut [MaybeUninit<T>],
     cleared: &'a AtomicUsize,
@@ -31,7 +31,7 @@ impl<T: Overwritten> Uncleared<T> {
         }
     }
 
-    /// Parts of the given lengths, one after the other.
+    /// Consecutive parts of the given lengths.
     pub(super) fn parts(&mut self, lengths: impl IntoIterator<Item = usize>) -> Vec<Part<'_, T>> {
         *self.cleared.get_mut() = 0;
         let mut rest = &mut self.values.spare_capacity_mut()[..self.length];
@@ -56,7 +56,8 @@ impl<T: Overwritten> Uncleared<T> {
         )
     }
 
-    /// The same of each of several equal pieces: which one, the first of its values, and the part.
+    /// [`chunks`](Self::chunks) of each of several equal pieces: index of the piece, index of the
+    /// first value in it, and the part.
     pub(super) fn chunks_of_each(
         &mut self,
         pieces: usize,
@@ -77,7 +78,7 @@ impl<T: Overwritten> Uncleared<T> {
     /// The written memory.
     ///
     /// # Panics
-    /// If a part was never cleared, which is a mistake of the caller's and depends on no input.
+    /// If a part was never cleared, which is a bug of the caller and depends on no input.
     pub(super) fn written(self) -> Vec<T> {
         let Self {
             mut values,
@@ -85,20 +86,20 @@ impl<T: Overwritten> Uncleared<T> {
             mut cleared,
         } = self;
         assert_eq!(*cleared.get_mut(), length, "a part was never cleared");
-        // SAFETY: parts do not overlap, and one is cleared once, as that consumes it; so those
-        // handed out last, which have cleared as many values as there are, have cleared all.
+        // SAFETY: parts do not overlap, and clearing one consumes it. As the current parts have
+        // cleared as many values as there are, they have cleared all.
         unsafe { values.set_len(length) };
         values
     }
 }
 
 impl<'a, T: Overwritten> Part<'a, T> {
-    /// Zeros.
+    /// The part, filled with zeros.
     pub(super) fn cleared(self) -> &'a mut [T] {
         self.filled(T::CLEAR)
     }
 
-    /// Values that are all written before any is read. Tests fill them with NaN first.
+    /// The part, for values that are all written before any is read. Tests fill it with NaN first.
     pub(super) fn overwritten(self) -> &'a mut [T] {
         #[cfg(test)]
         if super::poison::is_on() {

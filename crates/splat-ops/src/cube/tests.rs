@@ -1,4 +1,4 @@
-//! The CubeCL kernels, through Burn and its autodiff, against the native path in f32.
+//! Compares the CubeCL kernels, through Burn and its autodiff, with the native path in f32.
 
 use burn::tensor::{Device, DeviceKind, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
@@ -9,7 +9,7 @@ use crate::{
     SsimArgs, adam_step, gaussian_blur, project, rasterize, spherical_harmonics, ssim_map,
 };
 
-/// Whether there is a wgpu adapter, a software one included.
+/// True if there is a wgpu adapter, a software one included.
 pub(crate) fn has_adapter() -> bool {
     use cubecl::device::WgpuDeviceKind::{Cpu, DefaultDevice};
     let opened = [DefaultDevice, Cpu]
@@ -72,7 +72,7 @@ impl Scene {
         }
     }
 
-    /// The blurred image and the gradients of every input, named.
+    /// The blurred image and the named gradients of every input.
     fn run(&self, device: &Device, deterministic: bool) -> Vec<(&'static str, Vec<f32>)> {
         fn tensor<const D: usize>(scene: &Scene, which: usize, device: &Device) -> Tensor<D> {
             let (_, shape, values) = &scene.values[which];
@@ -177,11 +177,11 @@ fn kernels_agree_with_the_native_path_in_images_and_all_gradients() {
             assert!(error <= 1e-4, "{name}: relative L2 {error:e}");
         }
     }
-    // The native path knows one way only.
+    // The native path has only one mode.
     assert_eq!(scene.run(&Device::flex(), false), native);
 }
 
-/// S, and the gradients of both images for random weights.
+/// S, and the gradients of both images under random weights.
 fn run_ssim(device: &Device, shape: [usize; 4], args: &SsimArgs) -> Vec<Vec<f32>> {
     let device = device.clone().autodiff();
     let mut rng = Pcg32::seed_from_u64(11);
@@ -203,8 +203,7 @@ fn structural_similarity_and_its_gradients_are_those_of_the_native_path() {
     if !has_adapter() {
         return;
     }
-    // Windows whose loops are unrolled, one whose loops are not, and images smaller than the
-    // window.
+    // Windows with unrolled loops, one without, and images smaller than the window.
     for (shape, taps) in [
         ([2, 19, 23, 3], 11),
         ([1, 5, 40, 1], 11),
@@ -226,7 +225,7 @@ fn structural_similarity_and_its_gradients_are_those_of_the_native_path() {
         for (what, (kernels, native)) in ["map", "x", "y"].iter().zip(kernels.iter().zip(&native)) {
             let error = relative_l2(kernels, native);
             println!("{shape:?}, {taps} taps, {what}: relative L2 {error:.1e}");
-            // A window of one value alone measures no contrast: c2 / c2 up to rounding, and no
+            // A window of a single value measures no contrast: c2 / c2 up to rounding, and no
             // gradient through it.
             let limit = if taps == 1 { 1e-4 } else { 1e-5 };
             assert!(error <= limit, "{shape:?}, {taps} taps, {what}: {error:e}");
@@ -234,9 +233,9 @@ fn structural_similarity_and_its_gradients_are_those_of_the_native_path() {
     }
 }
 
-/// Three steps of Adam; a gradient in the second is not a number, one in the third too large to be
-/// squared. Some rows have no gradient, one nothing but NaN, one nothing but infinity. What went
-/// into the first step is `held` or given away.
+/// Three steps of Adam. The second has a NaN in its gradient, the third a value too large to
+/// square. Some rows have no gradient, one only NaN, one only infinity. The inputs of the first
+/// step are `held` or given away.
 fn run_adam(device: &Device, rows: AdamRows, held: bool) -> Vec<f32> {
     let mut rng = Pcg32::seed_from_u64(12);
     let mut values = |low: f32, high: f32| {
@@ -297,7 +296,7 @@ fn a_step_of_adam_is_that_of_the_native_path() {
     }
 }
 
-/// Distance in units in the last place, of positive floats.
+/// Distance of two positive floats in units in the last place.
 fn ulps(a: f32, b: f32) -> u32 {
     a.to_bits().abs_diff(b.to_bits())
 }
@@ -331,7 +330,7 @@ fn the_exponential_is_that_of_the_native_path() {
     let fused = compare(exp2_neg_of_one::<true>);
     let plain = compare(exp2_neg_of_one::<false>);
     println!("(worst distance in ulp, values that differ): fused {fused:?}, plain {plain:?}");
-    // WGSL leaves it to the device whether its fma is one rounding or two, but not to mix them.
+    // WGSL lets the device choose whether fma rounds once or twice, but not mix the two.
     assert!(
         fused.0 == 0 || plain.0 == 0,
         "fused {fused:?}, plain {plain:?}"
@@ -385,8 +384,7 @@ fn too_many_pairs_are_an_error_of_the_op_and_not_a_panic() {
     );
 }
 
-/// A device of wgpu's that has no more of `max_storage_buffers_per_shader_stage` than WebGPU
-/// promises.
+/// A wgpu device with only as many `max_storage_buffers_per_shader_stage` as WebGPU guarantees.
 fn device_with_webgpu_bindings() -> Option<Device> {
     use cubecl::wgpu::WgpuSetup;
     use cubecl::wgpu::wgpu::{DeviceDescriptor, Instance, Limits, RequestAdapterOptions};

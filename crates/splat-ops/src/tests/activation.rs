@@ -1,11 +1,11 @@
-//! Activations and their gradients keep their digits at both ends.
+//! Activations and their gradients are accurate at both ends.
 
 use burn::tensor::{Tensor, TensorData};
 
 use super::devices;
 use crate::{exp, sigmoid};
 
-/// Against double precision: at both ends, at the bend, and between. Below a logit of -87 the
+/// Compared with double precision at both ends, at the bend, and between. Below a logit of -87 the
 /// opacity itself leaves the range of normal floats.
 #[test]
 fn activations_and_their_gradients_keep_their_digits() {

@@ -1,10 +1,10 @@
-//! The backward pass decides about every (pixel, splat) pair as the forward pass did, also within a
-//! few units in the last place of a threshold: 1,075,200 pairs.
+//! The backward pass makes the same decision about every (pixel, splat) pair as the forward pass,
+//! even within a few units in the last place of a threshold: 1,075,200 pairs.
 //!
-//! Splats so wide that alpha differs by a few units over a tile lie on the threshold. Each has its
-//! own camera with an image of one tile. Every pixel has a whole number for its gradient: the sum
-//! over those that the backward pass takes for blended can be read off the splat's gradient, and
-//! the same sum over those that are lit off the image.
+//! Splats so wide that alpha differs by only a few units over a tile lie on the threshold. Each has
+//! its own camera with an image of one tile. Every pixel has an integer gradient, so the sum over
+//! the pixels that count as blended can be read from the splat's gradient, and the same sum over
+//! lit pixels from the image.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
@@ -17,7 +17,7 @@ const CAMERAS: usize = 1400;
 const SIDE: usize = 16;
 const PIXELS: usize = SIDE * SIDE;
 
-/// The image `[C, PIXELS]` of the splats' only channel, and the gradients `[C, N]` of colours and
+/// The image `[C, PIXELS]` of the only channel, and the gradients `[C, N]` of colours and
 /// opacities.
 struct Outcome {
     image: Vec<f32>,
@@ -25,8 +25,8 @@ struct Outcome {
     opacities: Vec<f32>,
 }
 
-/// One tile per camera, seen through `opacities` `[C, N]`; of each camera's splats only the last
-/// one shines.
+/// Renders one tile per camera through `opacities` `[C, N]`; only the last splat of each camera has
+/// a colour.
 fn render(
     device: &Device,
     opacities: &[f32],
@@ -84,14 +84,14 @@ fn weights() -> Vec<f32> {
     weights.map(f32::from).collect()
 }
 
-/// `value` and the values up to `reach` units in the last place above it, one per camera.
+/// `value` and the next values up to `reach` units in the last place above it, one per camera.
 fn around(value: f32, reach: u32) -> impl Iterator<Item = f32> {
     let mut rng = Pcg32::seed_from_u64(52);
     (0..CAMERAS).map(move |_| f32::from_bits(value.to_bits() + rng.random_range(0..=reach)))
 }
 
-/// For each camera: the weights of the pixels that `chosen` picks by their value, summed, against
-/// what the backward pass says; and both outcomes must be frequent.
+/// For each camera, compares the summed weights of the pixels that `chosen` picks by value with the
+/// backward pass; both outcomes must be frequent.
 fn check(
     name: &str,
     image: &[f32],
@@ -146,8 +146,8 @@ fn backward_caps_what_forward_capped() {
     let weights = weights();
     for (name, device) in devices() {
         let outcome = render(&device, &opacities, &weights, &settings);
-        // The splat is the first one and its colour 1: the image is alpha, and the gradient of
-        // alpha the weight.
+        // The splat is the first, with colour 1: the image equals alpha, and the gradient of alpha
+        // the weight.
         check(
             &format!("{name}: below the cap"),
             &outcome.image,
@@ -160,8 +160,8 @@ fn backward_caps_what_forward_capped() {
 
 #[test]
 fn backward_stops_where_forward_stopped() {
-    // Half of the light passes the first splat, half of that the second: to within a few units as
-    // much as the stop.
+    // Half of the light passes the first splat, and half of that the second: within a few units of
+    // the stop.
     let settings = RasterizeSettings {
         transmittance_min: 0.25,
         ..Default::default()

@@ -1,4 +1,4 @@
-//! Promises of every backend: the native path, and the kernels where there is an adapter.
+//! Promises of every backend, tested on the native path and on the kernels if there is an adapter.
 
 mod activation;
 mod decisions;
@@ -11,7 +11,7 @@ mod sh_colors;
 
 use burn::tensor::Device;
 
-/// The devices of this machine, named.
+/// Devices of this machine, with names.
 fn devices() -> Vec<(&'static str, Device)> {
     #[allow(unused_mut)]
     let mut devices = vec![("Flex", Device::flex())];

@@ -1,4 +1,4 @@
-//! The photometric loss against the same composed of tensors, value and gradient.
+//! Compares the photometric loss with the same loss composed of tensor ops, in value and gradient.
 
 use burn::tensor::{DType, Device, Int, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
@@ -38,7 +38,7 @@ fn window(radius: i32, sigma: f64) -> SsimArgs {
     }
 }
 
-/// Pictures that have much in common, and a fifth of their values.
+/// Two similar images, equal in a fifth of their values.
 struct Pair {
     rendered: TensorData,
     levels: TensorData,
@@ -70,7 +70,7 @@ fn pair([b, h, w, d, e]: [usize; 5]) -> Pair {
     }
 }
 
-/// L1, SSIM and the gradient of what was rendered.
+/// L1, SSIM and the gradient of the rendered image.
 fn outcome(rendered: Tensor<4>, [l1, ssim]: [Tensor<1>; 2]) -> [Vec<f64>; 3] {
     let loss = l1.clone() * WEIGHTS[0] + ssim.clone() * WEIGHTS[1];
     let gradient = rendered.grad(&loss.backward()).unwrap();
@@ -95,7 +95,7 @@ fn fused(
     outcome(rendered, [measured.l1(), measured.ssim()])
 }
 
-/// The same of slices, maps and means, in double precision.
+/// The same from slices, maps and means, in double precision.
 fn composed(pair: &Pair, args: &SsimArgs) -> [Vec<f64>; 3] {
     let device = Device::flex().autodiff();
     let at = (&device, DType::F64);
@@ -155,7 +155,7 @@ fn one_sweep_gives_what_tensors_give() {
     }
 }
 
-/// Also those that shared memory does not hold.
+/// Includes windows that do not fit into shared memory.
 #[test]
 fn windows_of_any_length_give_what_tensors_give() {
     for radius in [0, 1, 9, 60] {
@@ -167,7 +167,7 @@ fn windows_of_any_length_give_what_tensors_give() {
             let at = (&device, DType::F32);
             let levels = Tensor::<4, Int>::from_data(pair.levels.clone(), (&device, DType::I32));
             let found = fused(pair.rendered.clone(), levels, &args, at);
-            // A window of one value alone measures no contrast: c2 / c2 up to rounding.
+            // A window of a single value measures no contrast: c2 / c2 up to rounding.
             let limit = if radius == 0 { 1e-4 } else { 1e-5 };
             check(
                 &format!("{name}, radius {radius}"),
@@ -203,7 +203,7 @@ fn any_number_of_threads_gives_the_same_bits() {
         })
     };
     let bits = |values: [Vec<f64>; 3]| values.map(|v| v.into_iter().map(f64::to_bits).collect());
-    // In single precision the order of sums would hardly show.
+    // In single precision, differences in summation order would hardly show.
     for dtype in [DType::F32, DType::F64] {
         let one: [Vec<u64>; 3] = bits(run(1, dtype));
         for threads in [2, 3] {
@@ -240,8 +240,7 @@ fn what_does_not_fit_is_refused() {
     assert!(photometric(zeros([1, 12, 13, 3]), zeros([1, 12, 13, 3]), &even).is_err());
 }
 
-/// Pixels that the mask leaves out count in neither value nor gradient, and one that keeps all is
-/// none.
+/// Masked pixels affect neither value nor gradient, and a full mask equals no mask.
 #[test]
 fn a_mask_leaves_pixels_out() {
     for (_, device) in devices() {
@@ -256,7 +255,7 @@ fn a_mask_leaves_pixels_out() {
             let kept = Tensor::<4>::ones([b, keep, w, 1], &device);
             let left_out = Tensor::<4>::zeros([b, h - keep, w, 1], &device);
             let mask = Tensor::cat(vec![kept, left_out.clone()], 1);
-            // What is left out is anything.
+            // Masked pixels may hold anything.
             let changed = rendered.clone() + change;
             let left = mask.clone().equal_elem(0.0).repeat_dim(3, 4);
             let rendered = rendered.mask_where(left, changed).detach().require_grad();
@@ -272,7 +271,7 @@ fn a_mask_leaves_pixels_out() {
             assert!(image[10 * row..].iter().all(|gradient| *gradient == 0.0));
             assert!(image[..10 * row].iter().any(|gradient| *gradient != 0.0));
         }
-        // L1 by hand: over the pixels kept.
+        // L1 by hand over the kept pixels.
         let rendered = pair.rendered.clone().try_into_vec::<f32>().unwrap();
         let values = pair.values.clone().try_into_vec::<f32>().unwrap();
         let pixels = (0..b * h * w).filter(|pixel| pixel / w % h < 10);

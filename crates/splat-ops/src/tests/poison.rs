@@ -1,6 +1,5 @@
 //! Every element of outputs and of scratch memory is written before it is read: with reserved
-//! memory full of NaN all ops give the same bits, in images and all gradients, and every one is
-//! finite.
+//! memory full of NaN all ops give the same bits, and all images and gradients are finite.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
@@ -31,9 +30,9 @@ struct Scene {
 }
 
 impl Scene {
-    /// Results of every op and all gradients, as bits. Splats lie in the left part of the image,
-    /// some behind the cameras and some too faint to be seen.
-    // Longer than a hundred lines: a call of every op, one after the other.
+    /// Results and gradients of every op, as bits. Splats lie in the left part of the image, some
+    /// behind the cameras, and some too faint to see.
+    // Longer than a hundred lines, as it calls every op in turn.
     fn run(&self, device: &Device) -> Vec<(&'static str, Vec<u32>)> {
         let (c, n, d) = (self.cameras, self.gaussians, self.channels);
         let device = device.clone().autodiff();
@@ -54,7 +53,7 @@ impl Scene {
         let background = leaf(uniform(&[c, d], 0.0, 1.0));
         let coeffs = leaf3(uniform(&[n, 16, 3], -0.3, 0.3));
         let dirs = leaf3(uniform(&[c, n, 3], -1.0, 1.0));
-        // The cameras stand 0.9 before the origin: a tenth of the splats is behind them.
+        // The cameras are 0.9 in front of the origin, so that a tenth of the splats is behind them.
         let mut viewmats = Vec::new();
         let mut intrinsics = Vec::new();
         for _ in 0..c {
@@ -117,7 +116,7 @@ impl Scene {
         let mut loss = blurred.clone().square().sum() + similarity.clone().square().sum();
         loss = loss + averages.clone().square().sum();
         if n > 0 {
-            // The rest has no gradient: rows that ops may pass over.
+            // The rest has no gradient, so ops may skip those rows.
             let half = |colors: &Tensor<3>| colors.clone().narrow(1, 0, n.div_ceil(2));
             loss = loss + half(&harmonics).square().sum() + half(&seen).square().sum();
             for activated in &activated {
@@ -206,7 +205,7 @@ fn reserved_memory_is_written_before_it_is_read() {
             let clean = scene.run(&device);
             poison(true);
             let poisoned = scene.run(&device);
-            // Not the same bits, but NaN does not come into these either.
+            // Not the same bits, but still no NaN.
             let as_they_come = Scene {
                 deterministic: false,
                 ..scene
@@ -214,7 +213,7 @@ fn reserved_memory_is_written_before_it_is_read() {
             as_they_come.run(&device);
             poison(false);
             let case = format!("{name}: C = {cameras}, N = {gaussians}, D = {channels}");
-            // With no splats some gradients are of nothing; otherwise all of them are there.
+            // Without splats some gradients are empty; otherwise all are present.
             assert!(gaussians == 0 || clean.len() == 26, "{case}");
             for ((part, clean), (_, poisoned)) in clean.iter().zip(&poisoned) {
                 assert!(clean == poisoned, "{case}: {part} differs");

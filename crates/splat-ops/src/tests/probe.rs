@@ -1,4 +1,4 @@
-//! The probe hears the gradient of the splats and changes nothing.
+//! The probe receives the gradient of the splats and changes nothing.
 
 use burn::tensor::{Tensor, TensorData};
 

@@ -1,4 +1,4 @@
-//! Gradients of a projection do not depend on which others are asked for; splats on the border are
+//! Gradients of a projection do not depend on which others are requested; splats on the border are
 //! culled.
 
 use burn::tensor::{Device, Tensor, TensorData};
@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use super::devices;
 use crate::{ImageSize, ProjectSettings, project};
 
-/// Gradients of means, quaternions, scales, poses and intrinsics, of those that are tracked.
+/// Gradients of means, quaternions, scales, poses and intrinsics, if tracked.
 fn gradients(device: &Device, tracked: [bool; 5]) -> [Option<Vec<f32>>; 5] {
     const POSES: [f32; 32] = [
         1.0, 0.0, 0.0, 0.1, 0.0, 1.0, 0.0, -0.2, 0.0, 0.0, 1.0, 3.0, 0.0, 0.0, 0.0, 1.0, //
@@ -80,8 +80,8 @@ fn a_gradient_alone_is_the_same_as_with_all_others() {
     }
 }
 
-/// The packed row of a Gaussian on the axis of a camera with the principal point (cx, cy), so that
-/// its mean lies there.
+/// Packed row of a Gaussian on the axis of a camera with principal point (cx, cy), where its mean
+/// therefore lies.
 fn on_axis(device: &Device, size: ImageSize, [cx, cy]: [f32; 2]) -> [f32; 9] {
     let at = |values: Vec<f32>| {
         let width = values.len();
@@ -111,7 +111,7 @@ fn on_axis(device: &Device, size: ImageSize, [cx, cy]: [f32; 2]) -> [f32; 9] {
 
 #[test]
 fn a_splat_whose_box_only_touches_the_border_is_culled() {
-    // So large that a border plus an extent, less the extent, is the border: both sums have as fine
+    // Large enough that border + extent - extent equals the border: both sums have equally fine
     // digits.
     let size = ImageSize {
         width: 40,

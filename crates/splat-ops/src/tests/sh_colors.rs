@@ -1,5 +1,5 @@
-//! `sh_colors` against the ops it is made of: values and all gradients, in double precision and on
-//! every device.
+//! Compares `sh_colors` with the ops it replaces: values and all gradients, in double precision and
+//! on every device.
 
 use burn::tensor::{Bool, DType, Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
@@ -21,9 +21,9 @@ struct Leaves {
 }
 
 impl Leaves {
-    /// Some colours are far below zero, one exactly zero, the first mean is at the first camera's
-    /// centre; every third Gaussian is unseen (see [`weights`]), and the coefficients of one of
-    /// those are not numbers.
+    /// Some colours are far below zero and one is exactly zero. The first mean is at the first
+    /// camera's centre. Every third Gaussian is unseen (see [`weights`]), and one of those has NaN
+    /// coefficients.
     fn new(c: usize, n: usize, device: &Device, dtype: DType) -> Self {
         let mut rng = Pcg32::seed_from_u64(70);
         let mut values =
@@ -35,7 +35,7 @@ impl Leaves {
             means[..3].copy_from_slice(&centers[..3]);
             sh0[3..6].fill(-9.0);
             sh_rest[2 * 45..3 * 45].fill(f64::NAN);
-            // A dark one has a channel exactly on the clamp at any degree.
+            // A dark Gaussian has a channel exactly on the clamp at any degree.
             sh0[3 * 4] = -0.5 / 0.282_094_791_773_878_14;
             for k in 0..15 {
                 sh_rest[4 * 45 + 3 * k] = 0.0;
@@ -75,7 +75,7 @@ impl Leaves {
         (colors + 0.5).clamp_min(0.0)
     }
 
-    /// Colours of what is seen, then the gradients that there are.
+    /// Colours of seen Gaussians, then the gradients that exist.
     fn results(&self, colors: Tensor<3>) -> Vec<(&'static str, Vec<f64>)> {
         let [c, n, _] = colors.dims();
         let mut rng = Pcg32::seed_from_u64(71);
@@ -91,7 +91,7 @@ impl Leaves {
         self.values_and_gradients(colors.mask_fill(seen, 0.0), weights)
     }
 
-    /// Colours, then the gradients that there are, given that of the colours.
+    /// Colours, then the gradients that exist, from the gradient of the colours.
     fn values_and_gradients(
         &self,
         colors: Tensor<3>,
@@ -143,7 +143,7 @@ fn colors_and_gradients_are_those_of_the_composed_ops() {
             let leaves = Leaves::new(c, n, &device, dtype);
             let fused = leaves.results(leaves.fused(degree, None));
             let composed = leaves.results(leaves.composed(degree));
-            // At degree 0 the direction and the rest are no part of it.
+            // At degree 0 directions and higher coefficients are not part of the graph.
             assert_eq!(fused.len(), if degree == 0 { 2 } else { 5 }, "{case}");
             for (part, fused) in &fused {
                 let (_, composed) = composed.iter().find(|(name, _)| name == part).unwrap();
@@ -155,8 +155,8 @@ fn colors_and_gradients_are_those_of_the_composed_ops() {
     }
 }
 
-/// All else is as without it, bit for bit; whatever lies behind gives what is culled a gradient
-/// that must not arrive.
+/// Everything else matches the result without `seen`, bit for bit; gradients that later ops give to
+/// culled Gaussians must not arrive.
 #[test]
 fn what_a_camera_culled_is_black_and_gets_no_gradient() {
     let mut cases: Vec<_> = devices()
@@ -168,8 +168,8 @@ fn what_a_camera_culled_is_black_and_gets_no_gradient() {
         let device = device.autodiff();
         for (c, n, degree) in [(1, 700, 3), (2, 65, 0), (3, 33, 2), (1, 1100, 1)] {
             let leaves = Leaves::new(c, n, &device, dtype);
-            // The third Gaussian, whose coefficients are no numbers, among what no camera sees; the
-            // last chunk ends with some that none sees.
+            // The third Gaussian, with NaN coefficients, is unseen; the last chunk ends with unseen
+            // ones.
             let is_seen = |camera: usize, gaussian: usize| {
                 gaussian % 3 != 2 && !(gaussian + camera).is_multiple_of(5) && gaussian + 4 < n
             };
@@ -207,8 +207,8 @@ fn what_a_camera_culled_is_black_and_gets_no_gradient() {
     }
 }
 
-/// Below zero the exact gradient stops; the recovering one passes on what descent would raise the
-/// channel by. Of what is not clamped both are the same.
+/// Below zero the exact gradient is zero; the recovering one passes what would raise the channel
+/// under descent. Without clamping both are equal.
 #[test]
 fn a_channel_below_zero_can_recover_if_asked_to() {
     const Y0: f32 = splat_core::SH_C0 as f32;
@@ -242,7 +242,7 @@ fn a_channel_below_zero_can_recover_if_asked_to() {
     }
 }
 
-/// A Gaussian with a broken coefficient is to be seen as broken, not as black.
+/// A Gaussian with a broken coefficient must look broken, not black.
 #[test]
 fn what_is_not_a_number_is_not_clamped() {
     for (name, device) in devices() {
@@ -309,9 +309,9 @@ fn what_does_not_fit_is_an_error() {
     }
 }
 
-/// Colours and gradients where the higher degrees are stored in half precision, against double
-/// precision of the coefficients before they were rounded; and those of exact ones. Bright ones: at
-/// the clamp the gradient has a step.
+/// Colours and gradients with higher degrees in half precision, and exact ones, against double
+/// precision of the unrounded coefficients. The colours are bright, as the gradient has a step at
+/// the clamp.
 #[test]
 fn half_precision_costs_so_much() {
     let (c, n) = (2, 2500);
@@ -343,7 +343,7 @@ fn half_precision_costs_so_much() {
                 println!("{name}, rest as {stored:?}: {part} {error:.1e}");
                 let bound = bounds[usize::from(*part != "colors")];
                 assert!(error <= bound, "{name}, {stored:?}: {part} {error:e}");
-                // That it was read as halves at all.
+                // Checks that halves were read at all.
                 let read = stored == DType::F16 && *part == "colors";
                 assert!(!read || error > 5e-6, "{name}: {error:e}");
             }

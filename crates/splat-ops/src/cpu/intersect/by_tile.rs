@@ -1,4 +1,4 @@
-//! The emitted tiles of all splats brought together tile by tile, and sorted there.
+//! Groups emitted tiles by tile, and sorts each tile's splats.
 
 use core::sync::atomic::{AtomicU32, Ordering::Relaxed};
 
@@ -11,24 +11,23 @@ use crate::cpu::real::Real;
 use crate::cpu::tiles::{CHUNK, Grid};
 use crate::cpu::uninit::{Part, Uncleared};
 
-/// Parts that the counting sort is done in, at most: each counts the tiles for itself.
+/// Most parts of the counting sort; each part counts the tiles on its own.
 const PARTS: usize = 16;
 
-/// The emitted intersections brought together tile by tile, in the order in which they were
-/// emitted.
+/// Emitted intersections grouped by tile, in the order of emission.
 pub(super) struct ByTile {
-    /// By emitted intersection: its splat.
+    /// Splat of each emitted intersection.
     owners: Vec<u32>,
-    /// Where the emitted intersections of each splat end.
+    /// End of the emitted intersections of each splat.
     ends: Vec<u32>,
     /// The emitted intersections by tile.
     intersections: Vec<AtomicU32>,
-    /// Where each tile's begin, and the last one's end.
+    /// Start of each tile, and the end of the last one.
     tiles: Vec<u32>,
 }
 
 impl ByTile {
-    /// By a counting sort.
+    /// Counting sort.
     pub(super) fn new(emitted: &[Emitted], splats: usize, grid: Grid) -> Self {
         let length = emitted.len().div_ceil(PARTS).max(1);
         let mut counts: Vec<Vec<u32>> = emitted
@@ -41,7 +40,7 @@ impl ByTile {
                 counts
             })
             .collect();
-        // From how many there are to where they go: tile by tile, and in a tile part by part.
+        // Turns counts into positions: by tile, and within a tile by part.
         let mut tiles = Vec::with_capacity(grid.tiles() + 1);
         let mut next = 0;
         for tile in 0..grid.tiles() {
@@ -88,8 +87,8 @@ impl ByTile {
         }
     }
 
-    /// The lists of the given Gaussians: each tile's intersections front to back, and in the order
-    /// of the Gaussians where their splats are equally deep.
+    /// The lists of the given Gaussians. Each tile is sorted front to back; equal depths keep the
+    /// order of the Gaussians.
     pub(super) fn sorted<T: Real>(self, listed: Vec<u32>, depths: &[T]) -> TileLists {
         let count = self.intersections.len();
         let mut splats = Uncleared::<u32>::new(count);
@@ -105,7 +104,7 @@ impl ByTile {
             .for_each_init(Vec::new, |keys, (splats, first)| {
                 let splats = splats.overwritten();
                 keys.clear();
-                // Intersections are numbered as the splats are.
+                // Intersections are numbered in the order of the splats.
                 let intersections = &self.intersections[*first as usize..][..splats.len()];
                 keys.extend(intersections.iter().map(|intersection| {
                     let intersection = intersection.load(Relaxed);
@@ -129,22 +128,22 @@ impl ByTile {
     }
 }
 
-/// Tiles that a chunk of splats emitted, and where they go.
+/// Tiles emitted by a chunk of splats, with their positions.
 struct Piece<'a> {
     emitted: &'a Emitted,
-    /// The first of the splats.
+    /// First splat.
     first: u32,
-    /// The first of the intersections.
+    /// First intersection.
     start: u32,
     owners: Part<'a, u32>,
     ends: Part<'a, u32>,
 }
 
 impl Piece<'_> {
-    /// Puts each intersection to the next place of its tile.
+    /// Puts each intersection at the next position of its tile.
     fn place(self, next: &mut [u32], intersections: &[AtomicU32]) {
         let Emitted { tiles, ends, .. } = self.emitted;
-        // How many splats begin at an intersection, and with their sum which splat it is of.
+        // Number of splats that begin at an intersection; the running sum gives the splat of each.
         let owners = self.owners.cleared();
         for ((end, own), splat) in self.ends.overwritten().iter_mut().zip(ends).zip(1..) {
             *end = self.start + own;
@@ -157,7 +156,7 @@ impl Piece<'_> {
             splat = splat.max(*owner);
             *owner = self.first + splat;
         }
-        // The places of one piece are anywhere, but no two pieces have one in common.
+        // Positions of one piece are scattered, but no two pieces share one.
         for (tile, intersection) in tiles.iter().zip(self.start..) {
             let place = &mut next[*tile as usize];
             intersections[*place as usize].store(intersection, Relaxed);
@@ -166,7 +165,7 @@ impl Piece<'_> {
     }
 }
 
-/// Memory that several threads write, each its own places. Every place is written before any is
+/// Memory that several threads write at disjoint positions. Every position is written before any is
 /// read.
 fn unset(len: usize) -> Vec<AtomicU32> {
     let values = overwritten::<u32>(len).into_iter();

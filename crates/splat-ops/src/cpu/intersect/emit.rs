@@ -1,8 +1,7 @@
-//! The splats of a view, and the tiles that each of them reaches.
+//! Splats of a view, and the tiles that each reaches.
 //!
-//! Splats are worked on side by side, as SIMD code. What depends on a splat, how many rows of tiles
-//! it reaches and how many tiles in each, is no branch wherever it can be avoided: it would be
-//! guessed wrongly as often as not.
+//! Works on several splats at once, as SIMD code. Data-dependent counts (rows of tiles, tiles per
+//! row) avoid branches where possible, as those would be mispredicted about half of the time.
 
 use super::super::real::Real;
 use super::super::simd::{LANES, Lanes, vectorized};
@@ -11,10 +10,10 @@ use super::super::tiles::{Grid, TILE};
 use crate::backend::PROJECTED_WIDTH;
 use crate::settings::RasterizeArgs;
 
-/// Rows of tiles that are looked at side by side for all splats. Few splats reach more.
+/// Rows of tiles examined at once for all splats. Few splats reach more.
 const ROWS: usize = 4;
 
-/// Tiles of a row that are written at once, whether a splat reaches as many or not.
+/// Tiles of a row written at once, even if a splat reaches fewer.
 const RUN: usize = 4;
 
 /// Inputs and settings that all splats of a view share.
@@ -27,18 +26,18 @@ pub(super) struct Emission<'a, T> {
     keeps: bool,
 }
 
-/// The tiles of some splats.
+/// Tiles of some splats.
 pub(super) struct Emitted {
-    /// One splat's after the other's, row by row, if they are kept.
+    /// Tiles splat by splat, row by row, if kept.
     pub(super) tiles: Vec<u32>,
-    /// Where each splat's end.
+    /// End of the tiles of each splat.
     pub(super) ends: Vec<u32>,
-    /// How many they are, kept or not.
+    /// Number of intersections, kept or not.
     pub(super) intersections: u64,
 }
 
 impl<'a, T: Real> Emission<'a, T> {
-    /// Tiles are only counted, or kept too.
+    /// Counts tiles, and keeps them if asked to.
     pub(super) fn new(
         [packed, colors, opacities]: [&'a [T]; 3],
         args: &RasterizeArgs,
@@ -56,7 +55,7 @@ impl<'a, T: Real> Emission<'a, T> {
 }
 
 vectorized! {
-    /// The splats of some Gaussians with their depths, and their tiles.
+    /// Splats of some Gaussians with their depths, and their tiles.
     pub(super) fn emit<T: Real, const FMA: bool>(
         emission: &Emission<T>,
         listed: &[u32],
@@ -87,15 +86,15 @@ vectorized! {
     }
 }
 
-/// Splats side by side.
+/// Several splats, one per lane.
 struct Block<T> {
     /// Mean and inverse Cholesky factor of a packed splat, and the opacity.
     given: [Lanes<T>; 6],
-    /// The splats, number by number.
+    /// The splats, one row per number.
     splats: [Lanes<T>; NUMBERS],
-    /// The first channels of their colours.
+    /// First channels of the colours.
     colors: [[T; GROUP]; LANES],
-    /// Half the heights of their ellipses.
+    /// Half heights of the ellipses.
     heights: Lanes<T>,
 }
 
@@ -109,7 +108,7 @@ impl<T: Real> Block<T> {
         }
     }
 
-    /// Up to [`LANES`] Gaussians. Lanes beyond hold what they held.
+    /// Loads up to [`LANES`] Gaussians. Further lanes keep their old contents.
     #[inline(always)]
     fn load(&mut self, emission: &Emission<T>, listed: &[u32], depths: &mut [T]) {
         let channels = emission.colors.len() / emission.opacities.len().max(1);
@@ -183,7 +182,7 @@ impl<T: Real> Block<T> {
     }
 }
 
-/// Adds tiles that lie side by side.
+/// Adds a run of adjacent tiles.
 #[inline(always)]
 fn write_run(start: i32, length: i32, tiles: &mut Vec<u32>) {
     let (start, length) = (start as u32, length.max(0) as usize);
@@ -197,15 +196,13 @@ fn write_run(start: i32, length: i32, tiles: &mut Vec<u32>) {
     }
 }
 
-/// The first row of tiles that an ellipse of this height reaches, and the one after the last, with
-/// half a pixel of slack.
+/// Range of tile rows that an ellipse of this height reaches, with half a pixel of slack.
 #[inline(always)]
 fn rows_of_tiles<T: Real>(mean: T, half: T, grid: Grid) -> [i32; 2] {
     tiles_between([mean - half, mean + half], T::of(0.5), grid.rows)
 }
 
-/// The first tile of a row whose box of pixel centres the ellipse touches, and the one after the
-/// last.
+/// Range of tiles in a row whose box of pixel centres touches the ellipse.
 #[inline(always)]
 fn tiles_of_row<T: Real>(splat: &Splat<T>, row: i32, grid: Grid) -> [i32; 2] {
     let top = T::of_index(row * TILE as i32) + T::of(0.5) - splat.mean[1];
@@ -219,11 +216,10 @@ fn tiles_of_row<T: Real>(splat: &Splat<T>, row: i32, grid: Grid) -> [i32; 2] {
     [start + first, start + after]
 }
 
-/// The first tile that an interval reaches, given some slack, and the one after the last, of
-/// `count` in a row or column.
-// In this precision and without a branch: in f64, and with casts that saturate, it takes most of
-// the time of the lists. The nearest integer to a half more is the next one; a ten-thousandth
-// stands for ties.
+/// Range of tiles, out of `count` in a row or column, that an interval reaches, with some slack.
+// Branch-free and in the precision of the op: in f64 with saturating casts it would dominate the
+// time of the lists. Rounding to nearest after adding a half gives the next integer; the extra
+// ten-thousandth breaks ties.
 #[inline(always)]
 fn tiles_between<T: Real>([low, high]: [T; 2], slack: T, count: usize) -> [i32; 2] {
     let (half, tie, count) = (T::of(0.5), T::of(1e-4), T::of(count as f64));
@@ -231,7 +227,7 @@ fn tiles_between<T: Real>([low, high]: [T; 2], slack: T, count: usize) -> [i32; 
         let at = (x - half) * T::of(1.0 / TILE as f64) + half + tie;
         at.greatest(T::ZERO).least(count).nearest()
     };
-    // A tile's pixels have their centres up to so far behind its first one's.
+    // Distance from a tile's first pixel centre to its last.
     let last = T::of((TILE - 1) as f64);
     [next(low - slack - last, -tie), next(high + slack, tie)]
 }
@@ -242,9 +238,8 @@ mod tests {
     use crate::ImageSize;
     use rand::{RngExt, SeedableRng};
 
-    /// Against brute force over every pixel: no tile that holds a visible pixel may be missing, and
-    /// a tile without one may only be listed if its box of pixel centres is touched between the
-    /// centres.
+    /// Compared with brute force over every pixel: no tile with a visible pixel may be missing, and
+    /// a tile without one may be listed only if the ellipse passes between its pixel centres.
     #[test]
     fn the_tiles_agree_with_brute_force_over_pixels() {
         const SIZE: [usize; 2] = [83, 141];
@@ -335,7 +330,7 @@ mod tests {
                 );
             }
         }
-        // Needles pass between pixel centres, and the last tiles reach beyond the image.
+        // Needles pass between pixel centres, and the last tiles extend beyond the image.
         assert!(
             kept as f64 <= 1.10 * needed as f64,
             "{kept} tiles for {needed}"

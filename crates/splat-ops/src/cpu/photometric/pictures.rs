@@ -1,5 +1,5 @@
-//! The two pictures in memory: what was rendered, whose pixels have more channels than count, and
-//! the target, in 8 bits or as it is.
+//! The two images in memory: the rendered one, which may have more channels than count, and the
+//! target, in 8 bits or as values.
 
 use core::ops::Range;
 
@@ -13,13 +13,13 @@ use crate::backend::Target;
 use crate::cpu::buffer::Buffer;
 use crate::cpu::real::Real;
 
-/// The memory of both.
+/// Memory of both images.
 pub(super) struct Pictures {
     /// `[B, H, W, E]`.
     rendered: Buffer,
     /// `[B, H, W, D]`.
     target: Buffer,
-    /// Whether the target is in 8 bits.
+    /// True if the target is in 8 bits.
     levels: bool,
     /// `[B, H, W, D]`.
     pub(super) shape: [usize; 4],
@@ -63,7 +63,7 @@ impl Pictures {
     }
 }
 
-/// Both pictures row by row; rows count through all images.
+/// Both images by row; rows are numbered through all images of the batch.
 pub(super) struct Rows<'a, T> {
     rendered: &'a [T],
     target: Values<'a, T>,
@@ -81,7 +81,7 @@ enum Values<'a, T> {
 }
 
 impl<T: Real> Rows<'_, T> {
-    /// The D channels of some pixels of a row: `x` of what was rendered, `y` of the target.
+    /// The D channels of some pixels of a row: `x` from the rendered image, `y` from the target.
     pub(super) fn load(&self, row: usize, columns: Range<usize>, x: &mut [T], y: &mut [T]) {
         let pixels = row * self.width + columns.start..row * self.width + columns.end;
         let values = |channels: usize| pixels.start * channels..pixels.end * channels;
@@ -94,10 +94,10 @@ impl<T: Real> Rows<'_, T> {
     }
 }
 
-/// The first D of the E channels of every pixel.
+/// First D of the E channels of each pixel.
 fn gather<T: Real>([d, e]: [usize; 2], pixels: &[T], out: &mut [T]) {
     match [d, e] {
-        // Colour and alpha, as they are rendered: copies of a known length.
+        // The common case of colour and alpha: copies of a known length.
         [3, 4] => {
             for (out, pixel) in out.chunks_exact_mut(3).zip(pixels.chunks_exact(4)) {
                 out.copy_from_slice(&pixel[..3]);
@@ -112,7 +112,7 @@ fn gather<T: Real>([d, e]: [usize; 2], pixels: &[T], out: &mut [T]) {
     }
 }
 
-/// Pixels of D channels to pixels of E, the others zero.
+/// Expands pixels from D channels to E; the others are zero.
 pub(super) fn spread<T: Real>([d, e]: [usize; 2], pixels: &[T], out: &mut [T]) {
     match [d, e] {
         [3, 4] => {

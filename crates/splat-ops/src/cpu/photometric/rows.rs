@@ -1,5 +1,5 @@
 //! Arithmetic on rows, in blocks of [`LANES`] values. Rows are [`padded`]: the last block of a
-//! range may reach over its end, where nothing is read that matters.
+//! range may extend past its end, into values that do not matter.
 
 use core::ops::Range;
 
@@ -8,16 +8,15 @@ use crate::cpu::simd::vectorized;
 
 /// mx, my, q, p.
 pub(super) const MOMENTS: usize = 4;
-/// Derivatives by mx, q, p, all but the second halved.
+/// Derivatives by mx, q, p; the first and last are halved.
 pub(super) const FIELDS: usize = 3;
 
-/// Values that are summed at once along a row.
+/// Values summed at once along a row.
 const LANES: usize = 16;
-/// Moments of each of two rows that are summed at once: the sums of all four have to fit a
-/// processor's registers.
+/// Moments of each of two rows summed at once; the sums of all four must fit into registers.
 const PAIR: usize = LANES / 2;
 
-/// The length of a row in memory that holds `values`: whole blocks, and one beyond.
+/// Length in memory of a row of `values`: whole blocks, and one more.
 pub(super) fn padded(values: usize) -> usize {
     values.next_multiple_of(LANES) + LANES
 }
@@ -44,9 +43,8 @@ fn add<T: Real, const FMA: bool, const L: usize, const N: usize>(
     }
 }
 
-/// Two rows of N values, one below the other, blurred down the columns: `rows` are those under the
-/// window of either, in which `values` finds a block. Two at once, as there is less to compute than
-/// to fetch.
+/// Blurs two adjacent rows of N values along the columns. `rows` are those under the window of
+/// either; `values` finds a block in one. Two rows at once, as loads cost more than arithmetic.
 #[inline(always)]
 fn blur_down<T: Real, Row, const FMA: bool, const L: usize, const N: usize>(
     rows: &[Row],
@@ -84,7 +82,7 @@ fn moments<T: Real, const FMA: bool>([x, y]: &[&[T]; 2], start: usize) -> [[T; P
     [x, y, squares, products]
 }
 
-/// A block of N rows, each the weighted sum of its values at `start`, `start + step` and so on.
+/// A block of N rows, each the weighted sum of values at `start`, `start + step`, ...
 #[inline(always)]
 fn blur_along<T: Real, const FMA: bool, const N: usize>(
     rows: &[&[T]; N],
@@ -144,7 +142,7 @@ vectorized! {
 }
 
 vectorized! {
-    /// Two rows of moments blurred down the columns, from the rows of x and y under the window of
+    /// Blurs two rows of moments along the columns, from the rows of x and y under the window of
     /// either.
     pub(super) fn moments_down<T: Real, const FMA: bool>(
         rows: &[[&[T]; 2]],
@@ -156,7 +154,7 @@ vectorized! {
 }
 
 vectorized! {
-    /// Two rows of fields blurred down the columns, from those under the window of either.
+    /// Blurs two rows of fields along the columns, from the rows under the window of either.
     pub(super) fn fields_down<T: Real, const FMA: bool>(
         rows: &[[&[T]; FIELDS]],
         window: &[T],
@@ -171,8 +169,8 @@ vectorized! {
 }
 
 vectorized! {
-    /// The fields and the similarity at `range`, from rows of moments that are blurred down the
-    /// columns, by blurring them along the row too. Beside the range the fields are zero.
+    /// Fields and similarity at `range`, by blurring rows of moments, already blurred along the
+    /// columns, along the row too. Outside the range the fields are zero.
     pub(super) fn fields_along<T: Real, const FMA: bool>(
         moments: [&[T]; MOMENTS],
         range: Range<usize>,
@@ -215,8 +213,8 @@ vectorized! {
 }
 
 vectorized! {
-    /// `scale (f0 + x f1 + y f2)` at `range`, f being fields that are blurred down the columns,
-    /// blurred along the row.
+    /// `scale (f0 + x f1 + y f2)` at `range`; f are fields, already blurred along the columns and
+    /// blurred here along the row.
     pub(super) fn slope_along<T: Real, const FMA: bool>(
         fields: [&[T]; FIELDS],
         pictures: [&[T]; 2],

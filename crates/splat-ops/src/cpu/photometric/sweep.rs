@@ -1,18 +1,18 @@
-//! The sweep over the rows of a picture.
+//! The sweep over the rows of an image.
 //!
 //! ```text
 //! S = A C / (B D),  A = 2 mx my + c1,  B = mx^2 + my^2 + c1,  C = 2 (p - mx my) + c2,  D = q - mx^2 - my^2 + c2
 //! d(sum S)/dx = blur(dS/dmx) + 2 x blur(dS/dq) + y blur(dS/dp)
 //! ```
 //!
-//! mx, my, q, p being the windowed means of x, y, x^2 + y^2, xy; outside of the pixels that count
-//! the three derivatives, the fields, are zero.
+//! Here mx, my, q, p are the windowed means of x, y, x^2 + y^2, xy. Outside the pixels that count,
+//! the three derivatives (the fields) are zero.
 //!
-//! A band of rows is one unit of parallel work; it goes down a strip of columns at a time. What the
-//! window reaches over is kept in rings: rows of the pictures, and rows of fields. A step takes in
-//! two rows of the pictures, makes two of fields, a radius higher, and with these two of the
-//! gradient, a radius higher again. What the window reaches over beyond a band or a strip is
-//! computed by both neighbours.
+//! A band of rows is one unit of parallel work and is processed in strips of columns, from top to
+//! bottom. Ring buffers hold the rows that the window spans: rows of the images, and rows of
+//! fields. Each step reads two rows of the images, makes two rows of fields one radius above, and
+//! from these two rows of the gradient another radius above. Neighbouring bands and strips both
+//! compute what the window reaches beyond them.
 
 use core::ops::Range;
 
@@ -23,15 +23,15 @@ use crate::cpu::real::Real;
 use crate::settings::SsimArgs;
 use crate::ssim::counted;
 
-/// Most pixels of a strip: its rings stay in a core's second-level cache.
+/// Most pixels of a strip, so that its rings fit into a core's L2 cache.
 const STRIP: usize = 320;
-/// Inputs and settings that all bands share.
+/// Inputs and settings shared by all bands.
 pub(super) struct Sweep<'a, T> {
     rows: Rows<'a, T>,
     height: usize,
     /// Rows and columns of the pixels that count.
     counted: [Range<isize>; 2],
-    /// How many values count.
+    /// Number of values that count.
     pub(super) count: usize,
     window: Vec<T>,
     constants: [T; 2],
@@ -52,9 +52,9 @@ impl<'a, T: Real> Sweep<'a, T> {
         }
     }
 
-    /// Adds the absolute differences and the similarities of rows of an image to the `sums` of
-    /// each, which has the rows from `first` on. `slope` is the memory of these rows, for the
-    /// gradient of the mean similarity.
+    /// Adds the absolute differences and similarities of rows of an image to the `sums` of each
+    /// row, starting at `first`. `slope` is the memory of these rows for the gradient of the mean
+    /// similarity.
     pub(super) fn band(
         &self,
         image: usize,
@@ -66,7 +66,7 @@ impl<'a, T: Real> Sweep<'a, T> {
         let (width, channels) = (self.rows.width, self.rows.channels);
         let rows = first as isize..(first + sums.len()) as isize;
         let radius = (self.window.len() / 2) as isize;
-        // Rows of fields that a gradient needs beyond its own.
+        // Extra rows of fields that a gradient needs.
         let reach = if slope.is_some() { radius } else { 0 };
         let strips = width.div_ceil(STRIP);
         for index in 0..strips {
@@ -82,7 +82,7 @@ impl<'a, T: Real> Sweep<'a, T> {
                 for row in [row, row + 1] {
                     count(0, row, strip.load(row, scratch));
                 }
-                // From here on all rows under the window are there.
+                // From here on all rows under the window are loaded.
                 let row = row - radius;
                 if row < rows.start - reach {
                     continue;
@@ -105,13 +105,13 @@ impl<'a, T: Real> Sweep<'a, T> {
     }
 }
 
-/// Memory that the bands of a thread share.
+/// Scratch memory, reused by all bands of a thread.
 pub(super) struct Scratch<T> {
-    /// Per row of the ring x and y.
+    /// x and y, per row of the ring.
     pictures: Vec<T>,
-    /// Per row of the ring the fields.
+    /// The fields, per row of the ring.
     fields: Vec<T>,
-    /// Two rows blurred down the columns.
+    /// Two rows blurred along the columns.
     blurred: Vec<T>,
     /// A row of results.
     results: Vec<T>,
@@ -130,7 +130,7 @@ impl<T> Default for Scratch<T> {
 }
 
 impl<T: Real> Scratch<T> {
-    /// Memory for rings of so many rows. What it holds is written before it is read.
+    /// Makes room for rings of this size. All memory is written before it is read.
     fn reserve(&mut self, ring: usize, length: usize) {
         for (memory, rows) in [
             (&mut self.pictures, 2 * ring),
@@ -145,8 +145,8 @@ impl<T: Real> Scratch<T> {
     }
 }
 
-/// A strip of a band. Rows in memory have two radii of pixels on either side of it: fields are
-/// needed one radius beyond it, and pictures another.
+/// A strip of a band. Rows in memory extend two radii of pixels on either side: fields are needed
+/// one radius beyond the strip, and images another radius.
 struct Strip<'a, T> {
     sweep: &'a Sweep<'a, T>,
     image: usize,
@@ -168,38 +168,38 @@ impl<'a, T: Real> Strip<'a, T> {
         }
     }
 
-    /// Rows that the windows of two rows reach over.
+    /// Number of rows under the windows of two adjacent rows.
     fn ring(&self) -> usize {
         self.sweep.window.len() + 1
     }
 
-    /// The strip with a margin, as far as it lies in `within`.
+    /// The strip with a margin, clipped to `within`.
     fn with_margin(&self, margin: isize, within: &Range<isize>) -> Range<isize> {
         let start = (self.columns.start - margin).max(within.start);
         start..(self.columns.end + margin).min(within.end).max(start)
     }
 
-    /// Where columns lie in a row in memory.
+    /// Position of columns within a row in memory.
     fn values(&self, columns: &Range<isize>) -> Range<usize> {
         let origin = self.columns.start - 2 * self.radius;
         let at = |column| (column - origin) as usize * self.sweep.rows.channels;
         at(columns.start)..at(columns.end)
     }
 
-    /// The place of a row in a ring of N rows per row.
+    /// Position of a row in a ring with N rows per row.
     fn place<const N: usize>(&self, row: isize) -> Range<usize> {
         let slot = row.rem_euclid(self.ring() as isize) as usize;
         slot * N * self.length..(slot + 1) * N * self.length
     }
 
-    /// The rows of a ring under the windows around `row` and the next, from above.
+    /// Rows of a ring under the windows around `row` and the next one, top to bottom.
     fn under_window<'m, const N: usize>(&self, ring: &'m [T], row: isize) -> Vec<[&'m [T]; N]> {
         (row - self.radius..=row + self.radius + 1)
             .map(|row| split(&ring[self.place::<N>(row)], self.length))
             .collect()
     }
 
-    /// Takes in a row of the pictures, zeros outside. The strip's sum of absolute differences.
+    /// Loads a row of the images, zero outside. Returns the strip's sum of absolute differences.
     fn load(&self, row: isize, scratch: &mut Scratch<T>) -> f64 {
         let Sweep { rows, height, .. } = self.sweep;
         let memory = &mut scratch.pictures[self.place::<2>(row)];
@@ -221,8 +221,8 @@ impl<'a, T: Real> Strip<'a, T> {
         rows::sum_of_differences(&x[own.clone()], &y[own])
     }
 
-    /// Makes a row of fields and the next, zero where no pixel counts. The strip's sums of
-    /// similarities.
+    /// Computes a row of fields and the next one; zero where no pixel counts. Returns the strip's
+    /// sums of similarities.
     fn fields(&self, row: isize, scratch: &mut Scratch<T>) -> [f64; 2] {
         let [counted, columns] = &self.sweep.counted;
         let within = self.with_margin(self.radius, columns);
@@ -258,14 +258,14 @@ impl<'a, T: Real> Strip<'a, T> {
         sums
     }
 
-    /// Blurs fields down the columns, for the gradient of a row and the next.
+    /// Blurs fields along the columns, for the gradient of a row and the next one.
     fn blur_fields(&self, row: isize, scratch: &mut Scratch<T>) {
         let fields = self.under_window::<FIELDS>(&scratch.fields, row);
         let mut blurred = split_twice(&mut scratch.blurred, self.length);
         rows::fields_down::<T>(&fields, &self.sweep.window, &mut blurred);
     }
 
-    /// Makes a row of the gradient, of the first or the second row of blurred fields.
+    /// Computes a row of the gradient from the first or second row of blurred fields.
     fn slope(&self, row: isize, index: usize, scratch: &mut Scratch<T>, out: &mut [T]) {
         let own = self.values(&self.columns);
         rows::slope_along(
@@ -295,7 +295,7 @@ fn split_mut<T, const N: usize>(memory: &mut [T], length: usize) -> [&mut [T]; N
     core::array::from_fn(|_| rows.next().unwrap_or_default())
 }
 
-/// The first N rows, and the next N.
+/// The first N rows, and the next N rows.
 fn split_twice<T, const N: usize>(memory: &mut [T], length: usize) -> [[&mut [T]; N]; 2] {
     let (first, second) = memory.split_at_mut(N * length);
     [first, second].map(|memory| split_mut(memory, length))

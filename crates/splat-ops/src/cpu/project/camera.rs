@@ -1,16 +1,16 @@
-//! One camera: how it sees a point, and the gradient of that. Another camera model replaces this
-//! file.
+//! One camera: its projection of a point, and the gradient of that. Another camera model replaces
+//! this file.
 
 use super::super::math::*;
 use super::super::real::Real;
 use crate::settings::ProjectArgs;
 
-/// A point as a camera sees it, and the camera linearised there.
+/// A point in a camera, with the camera linearised there.
 pub(super) struct Sight<T> {
-    /// In the camera's axes.
+    /// Position in camera space.
     pub(super) p: Vec3<T>,
     pub(super) mean: [T; 2],
-    /// x/z and y/z, clamped, and whether the clamp left them alone.
+    /// x/z and y/z, clamped; and whether they were inside the clamp.
     u: T,
     v: T,
     u_inside: bool,
@@ -19,7 +19,7 @@ pub(super) struct Sight<T> {
     pub(super) jw: Mat23<T>,
 }
 
-/// Gradients of a camera through one point, and of the point.
+/// Gradients of a camera through one point, and of that point.
 pub(super) struct CameraGradient<T> {
     pub(super) mean: Vec3<T>,
     /// Gradients of W and t.
@@ -38,7 +38,7 @@ pub(super) struct Camera<T> {
     fy: T,
     cx: T,
     cy: T,
-    /// Bounds of u and v for the Jacobian.
+    /// Bounds of u and v in the Jacobian.
     u: (T, T),
     v: (T, T),
     pub(super) width: T,
@@ -47,7 +47,7 @@ pub(super) struct Camera<T> {
     pub(super) far: T,
     /// Square root of `eps2d`.
     pub(super) blur: T,
-    /// Standard deviations to where alpha has fallen from 1 to `alpha_min`.
+    /// Distance in standard deviations at which alpha has fallen from 1 to `alpha_min`.
     pub(super) reach: T,
 }
 
@@ -108,7 +108,7 @@ impl<T: Real> Camera<T> {
         }
     }
 
-    /// Given the gradients of screen mean, depth and J W of the point at `mean`.
+    /// Gradients, from those of screen mean, depth and J W of the point at `mean`.
     #[inline(always)]
     pub(super) fn sight_backward(
         &self,
@@ -144,7 +144,8 @@ impl<T: Real> Camera<T> {
         dfy += grad[1] * y_z;
         let (mut dx_z, mut dy_z) = (grad[0] * fx, grad[1] * fy);
 
-        // Clamp: inside it passes on; outside u = const / fx - cx / fx is the camera's.
+        // Inside the clamp the gradient passes; outside, u = const / fx - cx / fx depends on the
+        // camera only.
         if s.u_inside {
             dx_z += du;
         } else {

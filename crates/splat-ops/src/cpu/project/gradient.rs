@@ -1,5 +1,5 @@
-//! The vector-Jacobian product of the projection, for one Gaussian and one camera; without a
-//! branch, as its forward.
+//! The vector-Jacobian product of the projection, for one Gaussian and one camera. Branch-free,
+//! like the forward pass.
 
 use super::super::math::*;
 use super::super::real::Real;
@@ -14,7 +14,7 @@ pub(super) struct Gradient<T> {
     pub(super) scale: Vec3<T>,
 }
 
-/// Given the gradient of the first seven columns of [`Splat::packed`]; the extents carry none.
+/// From the gradient of the first seven columns of [`Splat::packed`]; the extents carry none.
 #[inline(always)]
 pub(super) fn splat_backward<T: Real>(
     g: Gaussian<T>,
@@ -36,7 +36,7 @@ pub(super) fn splat_backward<T: Real>(
     let ddet = -half * (g22 * w22 + grad[6] * compensation) / s.det;
     let dlength = two * ddet * s.minors_length + grad[6] / s.det.sqrt();
 
-    // a, b, det, |m| -> V. |m| has no derivative at zero; zero is its least subgradient.
+    // a, b, det, |m| -> V. |m| is not differentiable at zero; zero is its least subgradient.
     let dm = if s.minors_norm > T::ZERO {
         scale(s.minors, dlength / s.minors_norm)
     } else {

@@ -1,4 +1,4 @@
-//! One Gaussian seen by one camera: the forward formulas, without a branch, so that a loop over
+//! One Gaussian seen by one camera: the forward formulas. Branch-free, so that a loop over
 //! Gaussians becomes SIMD code.
 
 use splat_core::SPLAT_SIZE_MAX;
@@ -16,9 +16,9 @@ pub(super) struct Gaussian<T> {
     pub(super) scale: Vec3<T>,
 }
 
-/// Intermediate values of the forward pass; the backward pass computes them again.
+/// Intermediate values of the forward pass, recomputed in the backward pass.
 pub(super) struct Splat<T> {
-    /// Whether it is not culled. Where it is, all other fields may hold anything.
+    /// True if not culled; if culled, all other fields are unspecified.
     pub(super) visible: bool,
     pub(super) sight: Sight<T>,
     pub(super) unit: [T; 4],
@@ -26,13 +26,13 @@ pub(super) struct Splat<T> {
     pub(super) rotation: Mat3<T>,
     /// J W R.
     pub(super) jwr: Mat23<T>,
-    /// Unit of length of everything below but `packed`, in pixels.
+    /// Unit of length of the fields below, except `packed`, in pixels.
     pub(super) k: T,
     /// Larger than [`SPLAT_SIZE_MAX`]: its shape has no influence.
     pub(super) flat: bool,
     pub(super) v1: Vec3<T>,
     pub(super) v2: Vec3<T>,
-    /// Direction of the minors, not normalised, and its length.
+    /// Direction of the minors, unnormalised.
     pub(super) minors: Vec3<T>,
     pub(super) minors_norm: T,
     /// Length of the minors.
@@ -60,7 +60,7 @@ impl<T: Real> Splat<T> {
             apply_transposed(&rotation, jw[0]),
             apply_transposed(&rotation, jw[1]),
         ];
-        // V over its largest entry, `size` pixels.
+        // V divided by its largest entry, `size` pixels.
         let largest_scale = largest(g.scale);
         let shape = over(g.scale, largest_scale);
         let rows = [hadamard(jwr[0], shape), hadamard(jwr[1], shape)];
@@ -98,7 +98,7 @@ impl<T: Real> Splat<T> {
             extent[0],
             extent[1],
         ];
-        // Strict, as `splat_core` says of culling.
+        // Strict comparison, as `splat_core` defines culling.
         let reaches = (mean[0] + extent[0] > T::ZERO)
             & (mean[0] - extent[0] < camera.width)
             & (mean[1] + extent[1] > T::ZERO)

@@ -37,8 +37,8 @@ impl ShColorsBackend for Flex {
 }
 
 vectorized! {
-    /// Gradients of the directions, given `weights`, those of the basis functions. d = v / |v|: the
-    /// gradient of v is what is tangential, divided by |v|.
+    /// Gradients of the directions, from the gradients `weights` of the basis functions. d = v /
+    /// |v|: the gradient of v is the tangential part, divided by |v|.
     fn evaluate_backward<T: Real, const FMA: bool>(
         degree: usize,
         units: &[Lanes<T>; 4],
@@ -78,21 +78,21 @@ fn evaluate_degree_backward<T: Real, const DEGREE: usize>(
     }
 }
 
-/// The gradients of one chunk of Gaussians, where they belong; those that are not wanted are empty.
+/// Gradients of one chunk of Gaussians, in the output; empty if not wanted.
 struct Chunk<'a, T> {
     rows: Range<usize>,
     sh0: &'a mut [T],
     rest: &'a mut [T],
     means: &'a mut [T],
-    /// Whether the means' or the centres' are wanted.
+    /// True if the gradients of means or centres are wanted.
     directions: bool,
-    /// Whether all are zero still.
+    /// True while all are still zero.
     is_clear: bool,
 }
 
 impl<T: Real> Chunk<'_, T> {
-    /// Adds the gradients through one camera, given those of its colours; returns that of its
-    /// centre.
+    /// Adds the gradients through one camera, from those of its colours; returns the gradient of
+    /// its centre.
     fn add(&mut self, inputs: &Inputs<T>, camera: usize, grad: &[T]) -> Vec3<T> {
         let mut of_center = [T::ZERO; 3];
         let (center, is_seen) = inputs.camera(camera);
@@ -139,8 +139,9 @@ impl<T: Real> Chunk<'_, T> {
 }
 
 vectorized! {
-    /// Adds the gradients of the coefficients of up to [`LANES`] Gaussians, given the basis in
-    /// their directions and the gradients of all colours; and writes those of the basis functions.
+    /// Adds the gradients of the coefficients of up to [`LANES`] Gaussians, from the basis in their
+    /// directions and the gradients of all colours, and writes the gradients of the basis
+    /// functions.
     fn add_to_rows<T: Real, const FMA: bool>(
         chunk: &mut Chunk<T>,
         rows: &[usize],
@@ -170,7 +171,7 @@ fn add_to_degree<T: Real, const REST: usize>(
                 *grad = T::ZERO;
             }
         }
-        // A coefficient's gradient is its basis function times the colour's.
+        // The gradient of a coefficient is its basis function times the gradient of the colour.
         let i = n - chunk.rows.start;
         if !chunk.sh0.is_empty() {
             add_scaled(&mut chunk.sh0[3 * i..3 * i + 3], basis[0][lane], grad);
@@ -200,8 +201,8 @@ fn add_to_degree<T: Real, const REST: usize>(
     }
 }
 
-/// `out = scale values` for one scale after the other. Four numbers are written at once: the last
-/// one is overwritten by the next three.
+/// `out = scale values` for each scale in turn. Writes four numbers at a time; the next three
+/// overwrite the last one.
 #[inline(always)]
 fn write_scaled<T: Real, const COUNT: usize>(
     out: &mut [T],
