@@ -1,15 +1,14 @@
-//! The activations of scales and opacities, element by element, and their gradients (3DGS section
-//! 5.1).
+//! Activations of scales and opacities, elementwise, and their gradients (3DGS section 5.1).
 //!
 //! ```text
 //! exp(x)                           gradient g exp(x)
 //! sigmoid(x) = 1 / (1 + exp(-x))   gradient g e / (1 + e)²,  e = exp(-|x|)
 //! ```
-//! The gradient of the logistic function is made of its argument: of its value, `y (1 - y)` is zero
-//! once y rounds to 1.
+//! The gradient of the logistic function is computed from its argument: computed from its value, `y
+//! (1 - y)` would be zero once y rounds to 1.
 //!
 //! Floor per element: 4 bytes read, 4 written, about 18 operations. Gradients: 8 bytes read, 4
-//! written, and one operation, or about 20.
+//! written, and 1 (exp) or about 20 (sigmoid) operations.
 
 use cubecl::prelude::*;
 use splat_core::Activation;
@@ -40,7 +39,7 @@ fn activate_each(x: &[f32], y: &mut [f32], len: u32, #[comptime] function: Activ
         if comptime!(function == Activation::Exp) {
             y[i] = exp(x[i]);
         } else {
-            // exp(min(x, 0)) / (1 + exp(-|x|)): one exponential is 1 or the other.
+            // exp(min(x, 0)) / (1 + exp(-|x|)): one of the two exponentials is 1.
             let small = exp(-f32::abs(x[i]));
             let above = select(x[i] < 0.0f32, small, 1.0f32);
             y[i] = above / (1.0f32 + small);
@@ -48,7 +47,7 @@ fn activate_each(x: &[f32], y: &mut [f32], len: u32, #[comptime] function: Activ
     }
 }
 
-/// The function of every element, in the memory of `x` if nothing else holds it.
+/// Applies the function to every element, in the memory of `x` if nothing else holds it.
 pub fn activate(client: &Client, x: Buffer, function: Activation) -> Buffer {
     let len = x.len();
     let (y, [input, output]) = x.overwritten(client, 0);
@@ -58,7 +57,7 @@ pub fn activate(client: &Client, x: Buffer, function: Activation) -> Buffer {
     y
 }
 
-/// `known`: what came out of the exponential, what went into the logistic function.
+/// `known`: the output of the exponential, or the input of the logistic function.
 #[cube(launch)]
 fn activate_each_vjp(
     known: &[f32],
@@ -79,8 +78,8 @@ fn activate_each_vjp(
     }
 }
 
-/// Gradient of the argument `x` of [`activate`], given its value `y` and the gradient of that, in
-/// whose memory it is written if nothing else holds it.
+/// Gradient of the argument `x` of [`activate`], from its value `y` and the gradient of the value,
+/// in whose memory it is written if nothing else holds it.
 pub fn activate_vjp(
     client: &Client,
     [x, y]: [&Buffer; 2],

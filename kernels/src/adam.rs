@@ -3,11 +3,11 @@
 //! ```text
 //! m = beta_1 m + (1 - beta_1) g,   v = beta_2 v + (1 - beta_2) g²,   p = p - rate m / (√v + epsilon)
 //! ```
-//! A gradient whose square is not finite counts as zero. Parameter and moments are written where
-//! they are read, if nothing else holds their memory.
+//! A gradient whose square is not finite counts as zero. Parameter and moments are overwritten in
+//! place if nothing else holds their memory.
 //!
-//! Floor per value: 16 bytes read, 12 written, about 12 operations: bound by memory. Of a row that
-//! takes no step, 4 read.
+//! Floor per value: 16 bytes read, 12 written, about 12 operations; memory-bound. For a row that
+//! takes no step, 4 bytes read.
 
 use cubecl::prelude::*;
 use splat_core::{AdamRows, AdamStep};
@@ -16,7 +16,7 @@ use crate::bytes::{Bytes, Sizes};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
 use crate::math::is_finite;
 
-/// Weights of the old moments and of what is new, in this order; rate; epsilon.
+/// Weights of the old moments and of the new values, in this order; rate; epsilon.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 struct Numbers {
@@ -70,16 +70,16 @@ fn adam_values(
     }
 }
 
-/// Neither of the zeros nor NaN, by the bits: a device may take the smallest numbers for zero.
+/// True for values other than zeros and NaN, tested on the bits: a device may flush the smallest
+/// numbers to zero.
 #[cube]
 fn is_seen(grad: f32) -> bool {
     let magnitude = u32::reinterpret(grad) & 0x7fff_ffffu32;
     magnitude > 0u32 && magnitude <= 0x7f80_0000u32
 }
 
-/// Each workgroup has `rows` whole rows, at most as many as it has units. `copied`: which of the
-/// results lie elsewhere than what they are made of, so that what stays as it was must be written
-/// too.
+/// Each workgroup processes `rows` whole rows, at most as many as it has units. `copied` names the
+/// results that are not written in place, so that unchanged values must be copied.
 #[cube(launch)]
 fn adam_seen_rows(
     param: &[f32],
@@ -141,7 +141,7 @@ pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     }
 }
 
-/// Steps a parameter and its moments, given the gradient; all of one length, in rows of `width`.
+/// Steps a parameter and its moments, given the gradient. All have one length, in rows of `width`.
 pub fn adam(
     client: &Client,
     param: Buffer,

@@ -1,12 +1,11 @@
-//! Separable symmetric window over images [B, H, W, D], zero padding: the local means of SSIM.
+//! Separable symmetric window over images [B, H, W, D], zero-padded: the local means of SSIM.
 //!
 //! ```text
 //! out(i) = Σ_k window_k in(i + k - (len - 1)/2)      along x, then along y
 //! ```
-//! The window is symmetric, so the operator is its own adjoint: the gradient is blurred by the same
-//! function.
+//! The window is symmetric, so the operator is self-adjoint: the same function blurs the gradient.
 //!
-//! Floor per value: 8 bytes read and 8 written in two passes, 2 operations per pass and tap.
+//! Floor per value: 8 bytes read and 8 written in two passes; 2 operations per pass and tap.
 
 use cubecl::prelude::*;
 

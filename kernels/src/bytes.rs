@@ -1,4 +1,4 @@
-//! Bytes that a stage moves, and what they follow from.
+//! Bytes that a stage moves, and the sizes they follow from.
 
 /// Bytes read and written.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -10,7 +10,7 @@ pub struct Bytes {
 }
 
 impl Bytes {
-    /// Both ways together.
+    /// Sum of both directions.
     pub fn total(self) -> u64 {
         self.read + self.written
     }
@@ -27,14 +27,14 @@ impl core::ops::Add for Bytes {
     }
 }
 
-/// How large a training step is.
+/// Size of a training step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sizes {
     /// Gaussians.
     pub gaussians: u64,
-    /// Those that reach into the view.
+    /// Gaussians that reach into the view.
     pub visible: u64,
-    /// Intersections of splats and tiles.
+    /// Intersections, each of a splat and a tile.
     pub intersections: u64,
     /// Width of the view.
     pub width: u64,
@@ -44,8 +44,8 @@ pub struct Sizes {
     pub channels: u64,
     /// Degree of spherical harmonics.
     pub degree: usize,
-    /// Floats of one Gaussian that are trained.
+    /// Trained floats per Gaussian.
     pub parameters: u64,
-    /// Bits of a digit of the sort on this device: [`sort::digit_bits`](crate::sort::digit_bits).
+    /// Bits per digit of the sort on this device: [`sort::digit_bits`](crate::sort::digit_bits).
     pub digit_bits: u32,
 }

@@ -1,7 +1,7 @@
-//! A copy, to measure what the device's memory gives.
+//! A copy, to measure the device's memory bandwidth.
 //!
-//! Floor per value: 4 bytes read, 4 written, no operation: whatever this reaches, a stage bound by
-//! memory can reach.
+//! Floor per value: 4 bytes read, 4 written, no operation. Any memory-bound stage can reach the
+//! bandwidth of this kernel.
 
 use std::time::Instant;
 
@@ -18,12 +18,12 @@ fn copy_values(from: &[f32], to: &mut [f32], len: u32) {
     }
 }
 
-/// Bytes read and written per second by a kernel that copies `len` floats, one to a unit: the best
-/// of some runs, each long enough that waiting for its end hardly counts. Take more than the
-/// device's caches hold.
+/// Bytes read and written per second by a kernel that copies `len` floats, one per unit: the best
+/// of several runs, each long enough to hide the final wait. Choose `len` larger than the device's
+/// caches.
 ///
 /// # Errors
-/// The device's error, in words; or that there is nothing to copy.
+/// The device's error, in words; or that `len` is zero.
 pub fn bandwidth(client: &Client, len: usize) -> Result<f64, String> {
     let wait = || block_on(client.sync()).map_err(|error| format!("{error:?}"));
     let from = Buffer::from_f32(client, &vec![1.0; len]);
@@ -38,7 +38,7 @@ pub fn bandwidth(client: &Client, len: usize) -> Result<f64, String> {
         wait()?;
         Ok::<f64, String>(start.elapsed().as_secs_f64())
     };
-    // The first compiles the kernel.
+    // The first run compiles the kernel.
     copies(1)?;
     let count = (LEAST_SECONDS / copies(1)?.max(1e-6))
         .ceil()
@@ -50,8 +50,8 @@ pub fn bandwidth(client: &Client, len: usize) -> Result<f64, String> {
     Ok(8.0 * len as f64 / best)
 }
 
-/// Runs, of which the best counts.
+/// Number of runs, of which the best counts.
 const RUNS: usize = 5;
-/// Time of a run, about, unless it would take more copies than this.
+/// Approximate duration of a run, unless it would take more copies than this.
 const LEAST_SECONDS: f64 = 0.05;
 const MOST_COPIES: f64 = 1000.0;

@@ -1,4 +1,4 @@
-//! A device in words: what it has that the kernels ask for, and which variant of them runs there.
+//! Device properties that select kernel variants, and the variants selected.
 
 use cubecl::client::Client;
 use cubecl::features::{AtomicUsage, Plane};
@@ -6,7 +6,7 @@ use cubecl::features::{AtomicUsage, Plane};
 use crate::launch::{MOST_BUFFERS, bindable_buffers};
 use crate::{rasterize, sort};
 
-/// Properties of the client's device, by name, in an order for reading.
+/// Properties of the client's device, as names and values in display order.
 pub fn device_info(client: &Client) -> Vec<(&'static str, String)> {
     let (identity, hardware) = (&client.properties().identity, &client.properties().hardware);
     let planes = match (hardware.plane_size_min, hardware.plane_size_max) {

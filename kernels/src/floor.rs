@@ -1,13 +1,11 @@
-//! The bytes of device memory that a training step cannot do without: every stage reads each of its
-//! inputs and writes each of its results once, with a perfect cache within a stage and none between
-//! stages.
+//! Device memory traffic that a training step cannot avoid: each stage reads each of its inputs and
+//! writes each of its results once, with a perfect cache within a stage and none between stages.
 //!
-//! Each stage states its own beside its kernels (`floor`); here they are put together for one
-//! camera. Counted are the kernels of this crate alone, not the tensor ops between them. Two
-//! estimates are in it: the lists of all tiles count to their ends, also where all pixels stop
-//! earlier; and what is said per Gaussian counts all of them, also those out of view, but for the
-//! colours, which leave those out. Neither is a bound that a kernel could not go below by knowing
-//! more than its input.
+//! Each stage states its own floor beside its kernels (`floor`); this file combines them for one
+//! camera. Only the kernels of this crate are counted, not the tensor ops between them. Two figures
+//! are estimates: the lists of all tiles count to their ends, even if all pixels stop earlier; and
+//! per-Gaussian figures count all Gaussians, including those out of view, except for the colours. A
+//! kernel that knew more than its input could go below both.
 
 pub use crate::bytes::{Bytes, Sizes};
 use crate::{
@@ -21,7 +19,7 @@ impl Sizes {
     }
 }
 
-/// The stages of a step by name, in order, and the floor of each.
+/// Stages of a step by name, in order, with the floor of each.
 pub fn step(sizes: &Sizes) -> Vec<(&'static str, Bytes)> {
     let [activations, activations_gradient] = activation::floor(sizes);
     let [project, project_gradient] = project::floor(sizes);

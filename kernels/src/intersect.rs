@@ -1,19 +1,19 @@
-//! Which splats touch which tiles, front to back (3DGS section 6).
+//! Lists the splats that touch each tile, front to back (3DGS section 6).
 //!
-//! Visible splats are packed together in the order of their index and sorted by depth (equal depths
-//! by index); each emits the tiles it touches in that order; a stable sort by tile then leaves the
-//! list of every tile in depth order. An *intersection* is one (splat, tile) pair, its *slot* its
-//! place in the order of emission: the slots of one splat are consecutive, so that gradients that
-//! were written to slots can be summed splat by splat, in order.
+//! Visible splats are compacted in the order of their index and sorted by depth (equal depths by
+//! index). Each emits the tiles it touches in that order; a stable sort by tile then leaves every
+//! tile's list in depth order. An *intersection* is one (splat, tile) pair, and its *slot* is its
+//! position in the order of emission. The slots of one splat are consecutive, so gradients written
+//! to slots can be summed splat by splat, in order.
 //!
 //! A splat touches a tile iff the ellipse `opacity exp(-sigma) >= alpha_min` meets the rectangle of
 //! the tile's pixel centres: sigma is convex, so unless its centre lies in the rectangle its
-//! minimum lies on an edge that faces it. One unit tries the tiles of one splat; those of a splat
-//! over more than 64 tiles are shared out to its workgroup.
+//! minimum lies on an edge that faces it. One unit tests the tiles of one splat; a splat over more
+//! than 64 tiles is shared by its workgroup.
 //!
-//! Floor: 28 bytes per splat read and 8 written per visible one; then per visible splat 32 bytes
-//! twice (counting and emitting) and some 40 operations per tile of its bounding box; 12 bytes
-//! written per intersection, and read again after the sort.
+//! Floor: 28 bytes read per splat and 8 written per visible one; then per visible splat 32 bytes
+//! twice (counting and emitting) and about 40 operations per tile of its bounding box; per
+//! intersection 12 bytes written, and read again after the sort.
 
 mod capacity;
 mod footprint;
@@ -37,7 +37,7 @@ use crate::work;
 /// Side of a tile in pixels.
 pub const TILE: u32 = TILE_SIDE as u32;
 
-/// The images that are rendered together.
+/// Images that are rendered together.
 #[derive(Clone, Copy, Debug)]
 pub struct Frames {
     /// C, number of cameras.
@@ -48,7 +48,7 @@ pub struct Frames {
     pub width: u32,
     /// Image height in pixels.
     pub height: u32,
-    /// Alpha below which a splat is not seen.
+    /// Alpha below which a splat is invisible.
     pub alpha_min: f32,
 }
 
@@ -97,39 +97,40 @@ pub(crate) struct Grid {
 pub struct TileLists {
     /// Number of intersections.
     pub intersections: usize,
-    /// Splat (camera N + Gaussian) of every intersection, by tile, front to back; there may be room
-    /// for more.
+    /// Splat (camera N + Gaussian) of every intersection, by tile, front to back. The buffer may
+    /// have spare capacity.
     pub splats: Buffer,
-    /// First intersection and end of every tile [tiles, 2].
+    /// First intersection and end of each tile [tiles, 2].
     pub ranges: Buffer,
-    /// Only sums in order need them.
+    /// Present only for ordered sums.
     pub slots: Option<Slots>,
 }
 
-/// A slot for every intersection, those of one splat side by side.
+/// A slot for each intersection; those of one splat are consecutive.
 #[derive(Clone, Debug)]
 pub struct Slots {
-    /// Slot of every intersection, in the order of the tiles' lists.
+    /// Slot of each intersection, in the order of the tiles' lists.
     pub of: Buffer,
-    /// How many splats of a lower index are visible; at the end how many there are, V [splats + 1].
+    /// Number of visible splats of a lower index; the last entry is their total number V [splats +
+    /// 1].
     pub visible: Buffer,
-    /// The visible splats, front to back: V of them, in memory for all.
+    /// Visible splats, front to back: V of them, in a buffer for all.
     pub order: Buffer,
     /// `offsets[j]..offsets[j + 1]`: the slots of splat `order[j]`, for j < V of [splats + 1].
     pub offsets: Buffer,
 }
 
-/// Why there are no tile lists.
+/// Errors of listing.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum IntersectError {
-    /// More intersections than can be indexed, or than a buffer of the device can hold.
+    /// More intersections than can be indexed or than a device buffer can hold.
     TooManyIntersections {
-        /// How many there are.
+        /// Number of intersections.
         count: u64,
-        /// How many can be listed.
+        /// Most that can be listed.
         limit: u64,
     },
-    /// The device failed, in its words.
+    /// The device failed, with its message.
     Device(String),
 }
 
@@ -147,7 +148,7 @@ impl fmt::Display for IntersectError {
 
 impl std::error::Error for IntersectError {}
 
-/// Floor of listing for one camera, without the sorts.
+/// Floor of the listing for one camera, without the sorts.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     Bytes {
         read: 28 * sizes.gaussians + 64 * sizes.visible + 12 * sizes.intersections,
@@ -155,12 +156,11 @@ pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     }
 }
 
-/// Lists the splats of every tile: `packed` [C, N, 9], `opacities` [C, N]. Waits for the device
-/// once, to learn the number of intersections.
+/// Lists the splats of every tile, from `packed` [C, N, 9] and `opacities` [C, N]. Waits for the
+/// device once, to learn the number of intersections.
 ///
 /// # Errors
-/// More intersections than can be indexed or than a buffer of the device holds, or a failing
-/// device.
+/// More intersections than can be indexed or than a device buffer can hold, or a device failure.
 pub fn intersect(
     client: &Client,
     packed: &Buffer,
@@ -172,10 +172,9 @@ pub fn intersect(
     Ok(counted.list(client, intersections))
 }
 
-/// Lists the splats of every tile as [`intersect`] does, and hands the lists to `then`, without a
-/// pause of the device: room is made for somewhat more intersections than there were lately, and
-/// the number is looked at when all is under way. Only if there were more is everything done once
-/// more.
+/// Lists the splats of every tile as [`intersect`] does, and passes the lists to `then` without
+/// stalling the device. Reserves somewhat more room than recent calls needed, and checks the actual
+/// number once everything is under way. If the room was too small, repeats the work.
 pub(crate) fn intersect_ahead<R>(
     client: &Client,
     packed: &Buffer,

@@ -1,4 +1,4 @@
-//! Host side of every stage: buffers with their length, and how work is folded into workgroups.
+//! Host side of every stage: buffers with their lengths, and the folding of work into workgroups.
 
 use std::pin::Pin;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -16,37 +16,37 @@ pub const CUBE_UNITS: u32 = 256;
 /// [`CUBE_UNITS`] as an index.
 pub(crate) const CUBE_UNITS_USIZE: usize = CUBE_UNITS as usize;
 
-/// Most storage buffers that a kernel of this crate binds. In WGSL CubeCL binds one more, with
+/// Most storage buffers that a kernel of this crate binds. In WGSL, CubeCL binds one more for
 /// lengths and scalars.
 ///
-/// Devices promise no more than 8 (`max_storage_buffers_per_shader_stage`, WebGPU's default); wgpu
-/// itself says 16 of DirectX devices without resource binding tier 3 and 29 of Metal.
+/// WebGPU guarantees 8 (`max_storage_buffers_per_shader_stage`); wgpu reports 16 for DirectX
+/// devices without resource binding tier 3, and 29 for Metal.
 pub const MOST_BUFFERS: u32 = 12;
 
-/// How many storage buffers kernels can bind on this device, CubeCL's own left out.
+/// Storage buffers that kernels can bind on this device, excluding CubeCL's own.
 pub fn bindable_buffers(client: &Client) -> u32 {
     client.properties().hardware.max_bindings
 }
 
-/// WebGPU's limit on workgroups along one dimension.
+/// WebGPU's limit of workgroups along one dimension.
 const MAX_CUBES_PER_DIMENSION: u32 = 65_535;
 
-/// Whether what [`Buffer::empty`] reserves is filled with [`POISONED`].
+/// True if [`Buffer::empty`] fills memory with [`POISONED`].
 static POISON: AtomicBool = AtomicBool::new(false);
 
-/// NaN as a float; as an index, far outside of any buffer.
+/// NaN as a float; as an index, far outside any buffer.
 const POISONED: u32 = 0x7fc0_0000;
 
-/// For tests, and for the whole process: from now on reserved memory is (or is no longer) full of
-/// NaN, so that an element that a kernel reads but none has written shows in the results.
+/// Switches, for the whole process, whether reserved memory is filled with NaN. For tests: an
+/// element that is read but was never written then shows in the results.
 #[doc(hidden)]
 pub fn poison(on: bool) {
     POISON.store(on, Ordering::Relaxed);
 }
 
-/// A device buffer of `len` elements of four bytes each (`f32` or `u32`), contiguous.
+/// Contiguous device buffer of `len` four-byte elements (`f32` or `u32`).
 ///
-/// Never smaller than one element on the device, so that it can always be bound.
+/// Holds at least one element on the device, so that it can always be bound.
 #[derive(Clone, Debug)]
 pub struct Buffer {
     handle: Handle,
@@ -54,10 +54,10 @@ pub struct Buffer {
 }
 
 impl Buffer {
-    /// Wraps a contiguous `handle` that holds at least `len` elements of four bytes.
+    /// Wraps a contiguous `handle` of at least `len` four-byte elements.
     ///
     /// # Errors
-    /// Gives the handle back if it is smaller than that.
+    /// Returns the handle if it is too small.
     pub fn new(handle: Handle, len: usize) -> Result<Self, Handle> {
         if handle.size_in_used() / 4 >= len as u64 {
             Ok(Self { handle, len })
@@ -66,7 +66,7 @@ impl Buffer {
         }
     }
 
-    /// Reserves `len` elements, not initialised.
+    /// Reserves `len` uninitialised elements.
     pub fn empty(client: &Client, len: usize) -> Self {
         work::reserved(len.max(1) * 4);
         if POISON.load(Ordering::Relaxed) {
@@ -101,17 +101,17 @@ impl Buffer {
         }
     }
 
-    /// Elements.
+    /// Number of elements.
     pub fn len(&self) -> usize {
         self.len
     }
 
-    /// Whether there are no elements.
+    /// True if there are no elements.
     pub fn is_empty(&self) -> bool {
         self.len == 0
     }
 
-    /// The device memory behind it.
+    /// The underlying device memory.
     pub fn into_handle(self) -> Handle {
         self.handle
     }
@@ -136,20 +136,20 @@ impl Buffer {
         self.start_reading(client).wait()
     }
 
-    /// Begins to copy the elements to the host. Work that is launched from now on neither delays
-    /// the copy nor waits for it.
+    /// Starts copying the elements to the host. Work launched from now on neither delays the copy
+    /// nor waits for it.
     pub(crate) fn start_reading<'a>(&self, client: &'a Client) -> PendingRead<'a> {
         PendingRead(Box::pin(client.read_async(vec![self.handle.clone()])))
     }
 
-    /// Whether something else holds the memory too.
+    /// True if something else holds the memory too.
     pub(crate) fn is_held(&self) -> bool {
         !self.handle.can_mut()
     }
 
-    /// For a kernel that reads this buffer as its buffer number `position` and writes a result of
-    /// the same length: where that comes, the same memory if nothing else holds it, and the
-    /// arguments for both.
+    /// Prepares a kernel that reads this buffer as its buffer number `position` and writes a result
+    /// of the same length: returns the result's buffer, which shares the memory if nothing else
+    /// holds it, and the arguments for both.
     pub(crate) fn overwritten(self, client: &Client, position: usize) -> (Self, [BufferArg; 2]) {
         if !self.is_held() {
             let arguments = [self.arg(), BufferArg::alias(position, self.len.max(1))];
@@ -162,14 +162,14 @@ impl Buffer {
 
     /// The buffer as a kernel argument.
     pub(crate) fn arg(&self) -> BufferArg {
-        // SAFETY: both constructors make sure that the handle holds `len` elements of four bytes,
-        // and every kernel of this crate views buffers as `f32` or `u32`.
+        // SAFETY: both constructors ensure that the handle holds `len` elements of four bytes, and
+        // every kernel of this crate views buffers as `f32` or `u32`.
         unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len.max(1)) }
     }
 }
 
-/// A device buffer of `len` floats of half precision, contiguous. Kernels read it where the device
-/// can.
+/// Contiguous device buffer of `len` half-precision floats, for devices whose kernels can read
+/// them.
 #[derive(Clone, Debug)]
 pub struct HalfBuffer {
     handle: Handle,
@@ -177,10 +177,10 @@ pub struct HalfBuffer {
 }
 
 impl HalfBuffer {
-    /// Wraps a contiguous `handle` that holds at least `len` elements of two bytes.
+    /// Wraps a contiguous `handle` of at least `len` two-byte elements.
     ///
     /// # Errors
-    /// Gives the handle back if it is smaller than that.
+    /// Returns the handle if it is too small.
     pub fn new(handle: Handle, len: usize) -> Result<Self, Handle> {
         if len > 0 && handle.size_in_used() / 2 >= len as u64 {
             Ok(Self { handle, len })
@@ -189,7 +189,7 @@ impl HalfBuffer {
         }
     }
 
-    /// Elements; never none.
+    /// Number of elements; at least one.
     #[allow(clippy::len_without_is_empty)]
     pub fn len(&self) -> usize {
         self.len
@@ -197,31 +197,32 @@ impl HalfBuffer {
 
     /// The buffer as a kernel argument, to be viewed as `f16`.
     pub(crate) fn arg(&self) -> BufferArg {
-        // SAFETY: the constructor makes sure that the handle holds `len` elements of two bytes.
+        // SAFETY: the constructor ensures that the handle holds `len` elements of two bytes.
         unsafe { BufferArg::from_raw_parts(self.handle.clone(), self.len) }
     }
 }
 
-/// Whether kernels on this device can read half precision.
+/// True if kernels on this device can read half precision.
 pub fn reads_half(client: &Client) -> bool {
     client.properties().supports_type(F16)
 }
 
-/// The type of single precision, for kernels that are made for several.
+/// Single precision, for kernels generic over the element type.
 pub(crate) const F32: ElemType = ElemType::Float(FloatKind::F32);
-/// That of half precision.
+/// Half precision, for kernels generic over the element type.
 pub(crate) const F16: ElemType = ElemType::Float(FloatKind::F16);
 
-/// Elements on their way to the host.
+/// Elements being copied to the host.
 pub(crate) struct PendingRead<'a>(
     Pin<Box<dyn Future<Output = Result<Vec<Bytes>, ServerError>> + Send + 'a>>,
 );
 
 impl PendingRead<'_> {
-    /// Waits until they are there.
+    /// Waits for the copy.
     pub fn wait(self) -> Result<Bytes, String> {
         work::waited();
-        // Where a thread cannot wait (in a browser) there is nothing unless it has come already.
+        // On platforms where a thread cannot wait (browsers), the read succeeds only if it has
+        // finished.
         let read = try_read_sync(self.0).ok_or("this platform cannot wait for the device")?;
         let read = read.map_err(|error| format!("{error:?}"))?;
         read.into_iter()
@@ -230,10 +231,10 @@ impl PendingRead<'_> {
     }
 }
 
-/// `cubes` workgroups, folded into two dimensions when there are more than one dimension can hold.
-/// Kernels see one linear `CUBE_POS`, which may run past `cubes`: they check it.
+/// `cubes` workgroups, folded into two dimensions if one is not enough. Kernels see a linear
+/// `CUBE_POS` that may exceed `cubes`, and check it.
 ///
-/// Every launch asks here once for its workgroups, so this is where launches are counted.
+/// Every launch passes through here once, so launches are counted here.
 pub(crate) fn cube_count(cubes: usize) -> CubeCount {
     work::launched();
     let cubes = u32::try_from(cubes).unwrap_or(u32::MAX);
@@ -244,7 +245,7 @@ pub(crate) fn cube_count(cubes: usize) -> CubeCount {
     CubeCount::Static(cubes.div_ceil(rows), rows, 1)
 }
 
-/// Workgroups and their size for one unit per element; `None` if there is nothing to do.
+/// Workgroups and their size for one unit per element; `None` if there are no elements.
 pub(crate) fn per_element(elements: usize) -> Option<(CubeCount, CubeDim)> {
     if elements == 0 {
         return None;

@@ -1,21 +1,20 @@
-//! CubeCL kernels for Gaussian splatting, and nothing else: no tensor library.
+//! CubeCL kernels for Gaussian splatting, independent of any tensor library.
 //!
-//! One file per stage, the forward pass beside its vector-Jacobian product, in the order of the
-//! data's way: [`activation`], [`project`] and [`sh_colors`] (of spherical harmonics, [`sh`]) turn
-//! Gaussians into screen splats and their colours; [`intersect`] lists which tiles every splat
-//! touches, with [`scan`] and [`sort`]; [`rasterize`] blends each tile front to back;
-//! [`photometric`] compares the image with a photo. [`adam`] and [`screen_statistics`] are what
-//! else a training step does to every parameter and Gaussian. [`ssim`] is similarity pixel by
-//! pixel, [`blur`] a window by itself, [`exp`] our own exponential. [`work`] counts what was
-//! launched, [`floor`] says what it cannot do without, and [`copy`] how fast the device's memory
-//! is.
+//! One file per stage, with the forward pass beside its vector-Jacobian product, in the order of
+//! the pipeline. [`activation`], [`project`] and [`sh_colors`] (with [`sh`] for the harmonics) turn
+//! Gaussians into screen splats and colours; [`intersect`] lists the tiles that each splat touches,
+//! using [`scan`] and [`sort`]; [`rasterize`] blends each tile front to back; [`photometric`]
+//! compares the image with a photo. [`adam`] and [`screen_statistics`] complete a training step.
+//! [`ssim`] is similarity per pixel, [`blur`] a separable window, [`exp`] the exponential. [`work`]
+//! counts launches and memory, [`floor`] computes the unavoidable memory traffic, and [`copy`]
+//! measures memory bandwidth.
 //!
 //! Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous, row-major) and
-//! launch kernels without waiting, except where they say so. The same input gives the same bits on
-//! one device, unless a caller asks the rasteriser for sums without order ([`rasterize::Sums`]).
+//! launch kernels without waiting, unless documented otherwise. The same input gives the same bits
+//! on one device, unless the caller asks the rasteriser for unordered sums ([`rasterize::Sums`]).
 
-// `if comptime!(...)` decides while a kernel is built; joined to a condition on the device it would
-// decide there.
+// `if comptime!(...)` is decided while a kernel is built; joined to a device condition it would be
+// decided on the device.
 #![allow(clippy::collapsible_if)]
 
 pub mod activation;

@@ -1,16 +1,17 @@
-//! Mean absolute difference and mean structural similarity of a rendered image and a photo, in one
-//! launch and one that adds its sums; the gradient in one more. S and its derivatives are those of
-//! [`crate::ssim`].
+//! Mean absolute difference and mean structural similarity of a rendered image and a photo, in two
+//! launches: one for sums per tile, one to add them. The gradient takes one more. S and its
+//! derivatives are those of [`crate::ssim`].
 //!
-//! A workgroup has a tile of one channel. It windows the rows into shared memory, a unit making
-//! eight neighbouring values of each moment, and then the columns from there. What the gradient
-//! needs is kept, of each value three: weight times dS/dmx, dS/dq and dS/dp, channel by channel.
-//! The weight is one over the number of values that count, and zero for a value that does not.
+//! A workgroup processes a tile of one channel. It windows the rows into shared memory, each unit
+//! making eight neighbouring values of each moment, and then the columns from there. For the
+//! gradient, three values are kept per value and channel: weight times dS/dmx, dS/dq and dS/dp. The
+//! weight is one over the number of values that count, and zero for values that do not.
 //!
-//! Floor per pixel and channel. Forward: 4 bytes read and 1 of an 8-bit photo, or 4 of another; 12
-//! written to be kept; 2 x 4 x 11 fused multiply-adds with the window of 11. Gradient: 12 read, and
-//! both images again, 4 written; 2 x 3 x 11 fused multiply-adds. Values under the window but
-//! outside of the tile are read by its neighbours too, rows of them windowed twice: 26 rows for 16.
+//! Floor per pixel and channel. Forward: 4 bytes read, and 1 of an 8-bit photo or 4 of another; 12
+//! written to be kept; 2 x 4 x 11 fused multiply-adds with the window of 11. Gradient: 12 bytes
+//! read, and both images again; 4 written; 2 x 3 x 11 fused multiply-adds. Values under the window
+//! but outside the tile are read by neighbouring tiles too, and their rows windowed twice: 26 rows
+//! for 16.
 
 mod backward;
 mod forward;
@@ -24,7 +25,7 @@ use self::tile::{FIELDS, MOMENTS, PITCH, TILE_HEIGHT, TILE_WIDTH, UNITS};
 use crate::bytes::{self, Bytes};
 use crate::launch::{Buffer, CUBE_UNITS, cube_count};
 
-/// Floors of the loss of one view and of its gradient; the photo is of 8 bits.
+/// Floors of the loss of one view and of its gradient, with an 8-bit photo.
 pub(crate) fn floor(sizes: &bytes::Sizes) -> [Bytes; 2] {
     let values = sizes.pixels() * sizes.channels;
     [
@@ -39,25 +40,25 @@ pub(crate) fn floor(sizes: &bytes::Sizes) -> [Bytes; 2] {
     ]
 }
 
-/// How a photo lies in memory.
+/// Memory layout of a photo.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum TargetKind {
-    /// Values, 32-bit floats.
+    /// 32-bit float values.
     Values,
-    /// Levels, 255 for the value 1, 32-bit integers.
+    /// Levels as 32-bit integers; 255 means the value 1.
     Words,
-    /// Levels, four of 8 bits in a word, the first in its lowest.
+    /// 8-bit levels, four per word, the first in the lowest byte.
     Bytes,
 }
 
-/// Both images: what was rendered, [B, H, W, E], and the photo, [B, H, W, D].
+/// The two images: rendered, [B, H, W, E], and photo, [B, H, W, D].
 #[derive(Clone, Copy, Debug)]
 pub struct Images<'a> {
-    /// f32.
+    /// The rendered image, f32.
     pub rendered: &'a Buffer,
-    /// As `kind` says.
+    /// The photo, laid out as `kind` says.
     pub target: &'a Buffer,
-    /// How `target` holds its values.
+    /// Layout of `target`.
     pub kind: TargetKind,
 }
 
@@ -66,9 +67,9 @@ pub struct Images<'a> {
 pub struct PhotometricShape {
     /// B, images.
     pub images: usize,
-    /// Pixels.
+    /// Height in pixels.
     pub height: usize,
-    /// Pixels.
+    /// Width in pixels.
     pub width: usize,
     /// D.
     pub channels: usize,
@@ -83,7 +84,7 @@ pub struct PhotometricShape {
 }
 
 impl PhotometricShape {
-    /// Whether tiles of moments under this window fit into the shared memory of a workgroup.
+    /// True if tiles of moments under this window fit into the shared memory of a workgroup.
     pub fn fits(&self, client: &Client) -> bool {
         let floats = MOMENTS * self.rows() * PITCH + UNITS;
         4 * floats <= client.properties().hardware.max_shared_memory_size
@@ -111,8 +112,8 @@ impl PhotometricShape {
         self.images * self.channels * columns * rows
     }
 
-    /// How far from the image's edges a pixel counts for the mean similarity: that of a window that
-    /// reaches over them does not, unless all do.
+    /// Distance from the image edges at which a pixel counts for the mean similarity: its window
+    /// must lie inside, unless no window does.
     fn margin(&self) -> usize {
         let taps = self.window.len();
         if self.height < taps || self.width < taps {
@@ -122,7 +123,7 @@ impl PhotometricShape {
         }
     }
 
-    /// Values that count.
+    /// Number of values that count.
     fn counted(&self) -> usize {
         let margin = 2 * self.margin();
         self.images * (self.height - margin) * (self.width - margin) * self.channels
@@ -161,12 +162,12 @@ struct Sizes {
     c2: f32,
 }
 
-/// Mean absolute difference, and one less the mean similarity: `[2]`. `shape` must fit.
+/// Mean absolute difference and one minus the mean similarity, `[2]`. `shape` must fit.
 pub fn photometric(client: &Client, images: Images, shape: &PhotometricShape) -> Buffer {
     measure(client, images, shape, false).0
 }
 
-/// The same, and the derivatives [3, B, D, H, W] that [`photometric_vjp`] needs.
+/// [`photometric`], with the derivatives [3, B, D, H, W] that [`photometric_vjp`] needs.
 pub fn photometric_tracked(
     client: &Client,
     images: Images,
@@ -184,7 +185,7 @@ fn measure(
     let cubes = shape.cubes();
     let weights = Buffer::from_f32(client, &shape.window);
     let partials = Buffer::empty(client, 2 * cubes);
-    // Without derivatives there still is something to bind.
+    // Without derivatives the kernel still needs a buffer to bind.
     let fields = Buffer::empty(client, if keep { FIELDS * shape.values() } else { 1 });
     let means = Buffer::empty(client, 2);
     if cubes > 0 {
@@ -217,8 +218,8 @@ fn measure(
     (means, fields)
 }
 
-/// Gradient of what was rendered, [B, H, W, E], given what [`photometric_tracked`] kept and the
-/// gradient `[2]` of its means.
+/// Gradient of the rendered image, [B, H, W, E], from the derivatives of [`photometric_tracked`]
+/// and the gradient `[2]` of its means.
 pub fn photometric_vjp(
     client: &Client,
     images: Images,

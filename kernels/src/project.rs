@@ -10,15 +10,15 @@
 //! a = |V1|² + e, b = V1·V2                        det = |m|² + e(|V1|² + |V2|²) + e²
 //! w11 = 1/√a, w22 = √(a/det), w21 = -(b/a) w22    compensation = |m| / √det
 //! ```
-//! The determinant is a sum of terms that are never negative (Cauchy-Binet), so needles keep their
-//! precision. V and e are taken in units of the splat's own size (k pixels), so that nothing over-
-//! or underflows, be the splat a millionth of a pixel or a million pictures wide. Floor per
-//! Gaussian and camera: 40 bytes read, 36 written, about 150 operations; gradients: 76 bytes read,
-//! 40 written, and once more 76 read for those of cameras.
+//! The determinant is a sum of non-negative terms (Cauchy-Binet), so needles keep their precision.
+//! V and e are in units of the splat's own size (k pixels), so that nothing overflows or
+//! underflows, whether the splat is a millionth of a pixel or a million images wide. Floor per
+//! Gaussian and camera: 40 bytes read, 36 written, about 150 operations. Gradients: 76 bytes read,
+//! 40 written, and 76 more read for the gradients of cameras.
 //!
-//! One unit projects one Gaussian to one camera (`splat.rs`, by way of `camera.rs`; their gradients
+//! One unit projects one Gaussian to one camera (`splat.rs`, using `camera.rs`; gradients in
 //! `vjp.rs`). Gradients of Gaussians are summed over cameras inside one unit; gradients of cameras
-//! by blocks of Gaussians and then over the blocks, always in the same order: no atomics.
+//! over blocks of Gaussians and then over the blocks, always in the same order and without atomics.
 
 mod backward;
 mod camera;
@@ -34,8 +34,8 @@ use self::splat::{Gaussian, project_splat};
 use crate::bytes::{Bytes, Sizes};
 use crate::launch::{Buffer, per_element};
 
-/// Image size and [`ProjectSettings`] on the device; `blur` = √e; `reach` = √(2 ln(1/alpha_min)),
-/// standard deviations to the edge of a splat.
+/// Image size and [`ProjectSettings`] on the device. `blur` = √e; `reach` = √(2 ln(1/alpha_min)),
+/// the standard deviations to the edge of a splat.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 struct Uniforms {
@@ -110,7 +110,7 @@ fn project_forward(
     }
 }
 
-/// Floors of forward and gradient of the Gaussians for one camera.
+/// Floors of the forward pass and of the gradient of the Gaussians, for one camera.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let n = sizes.gaussians;
     [
@@ -125,7 +125,7 @@ pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     ]
 }
 
-/// Projects every Gaussian to every camera: packed splats [C, N, 9], all zero where culled.
+/// Projects every Gaussian to every camera: packed splats [C, N, 9], zero if culled.
 pub fn project(
     client: &Client,
     inputs: &ProjectInputs,

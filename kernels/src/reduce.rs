@@ -1,14 +1,14 @@
-//! Sums over many units in a fixed order: by halves within a workgroup, then workgroup after
+//! Sums over many units in a fixed order: by halves within a workgroup, then workgroup by
 //! workgroup.
 //!
-//! Floor per value: 4 bytes read and an addition.
+//! Floor per value: 4 bytes read and one addition.
 
 use cubecl::prelude::*;
 
 use crate::launch::{Buffer, per_element};
 
-/// The sum of `value` over the `units` of the workgroup, a power of two; all of them must come
-/// here. `shared` has room for one float of each.
+/// Sum of `value` over the `units` of the workgroup, a power of two. All units must call it.
+/// `shared` holds one float per unit.
 #[cube]
 pub(crate) fn sum_units(shared: &mut Shared<[f32]>, value: f32, #[comptime] units: usize) -> f32 {
     let unit = UNIT_POS as usize;
@@ -24,7 +24,7 @@ pub(crate) fn sum_units(shared: &mut Shared<[f32]>, value: f32, #[comptime] unit
         half /= 2;
     }
     let sum = shared[0];
-    // The next sum must not overwrite what another unit has yet to read.
+    // The next sum must not overwrite values that another unit has yet to read.
     sync_cube();
     sum
 }
@@ -43,7 +43,7 @@ fn sum_blocks_in_order(partials: &[f32], out: &mut [f32], rows: u32, blocks: u32
     }
 }
 
-/// Partial sums [`rows`, `blocks`, `values`] to sums [`rows`, `values`].
+/// Reduces partial sums [`rows`, `blocks`, `values`] to sums [`rows`, `values`].
 pub(crate) fn sum_blocks(
     client: &Client,
     partials: &Buffer,

@@ -1,21 +1,21 @@
 //! Prefix sums of `u32`, any length, modulo 2^32.
 //!
-//! Three steps: every workgroup sums its block; the block sums are scanned in the same way (one
-//! level less); every workgroup scans its block again on top of its block's start. Sums of
-//! integers, so the same bits in any order.
+//! Three steps: each workgroup sums its block; the block sums are scanned recursively; each
+//! workgroup scans its block again from its block's start. Sums are of integers, so the order does
+//! not matter.
 //!
-//! Floor per element: 8 bytes read (it is read twice), 4 written, 3 additions.
+//! Floor per element: 8 bytes read (each is read twice), 4 written, 3 additions.
 
 use cubecl::prelude::*;
 
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, PendingRead, cube_count};
 
-/// Consecutive elements of one unit.
+/// Consecutive elements per unit.
 const ITEMS: usize = 8;
-/// Elements of one workgroup.
+/// Elements per workgroup.
 pub(crate) const BLOCK: usize = CUBE_UNITS_USIZE * ITEMS;
 
-/// Exclusive prefix sum over the `units` of a workgroup, and the total. Every unit must call it;
+/// Exclusive prefix sum over the `units` of a workgroup, and the total. All units must call it;
 /// `shared` holds one value per unit.
 #[cube]
 pub(crate) fn cube_exclusive_sum(
@@ -59,8 +59,7 @@ fn block_sums(input: &[u32], sums: &mut [u32], len: u32, blocks: u32) {
     }
 }
 
-/// Scans each block of `input`, starting from `starts[block]` (from 0 where there is one block
-/// only).
+/// Scans each block of `input`, starting from `starts[block]` (from 0 if there is only one block).
 #[cube(launch)]
 fn scan_blocks(
     input: &[u32],
@@ -152,11 +151,11 @@ pub fn inclusive_sum(client: &Client, input: &Buffer) -> Buffer {
     scan(client, input, None, true)
 }
 
-/// A total on its way to the host.
+/// A total being copied to the host.
 pub struct PendingTotal<'a>(Option<PendingRead<'a>>);
 
 impl PendingTotal<'_> {
-    /// Waits for it.
+    /// Waits for the total.
     ///
     /// # Errors
     /// The device's error, in words.
@@ -170,10 +169,9 @@ impl PendingTotal<'_> {
     }
 }
 
-/// The exclusive sum, and the total of all elements without overflow: the blocks' sums are read
-/// back and added in 64 bits (2,048 elements share one sum, so elements up to 2^21 are safe). Does
-/// not wait for the device: what is launched before [`PendingTotal::wait`] runs while the total is
-/// on its way.
+/// The exclusive sum, and the total of all elements without overflow: the block sums are read back
+/// and added in 64 bits (2,048 elements share one sum, so elements up to 2^21 are safe). Does not
+/// wait for the device: work launched before [`PendingTotal::wait`] overlaps the copy.
 pub fn exclusive_sum_with_total<'a>(
     client: &'a Client,
     input: &Buffer,

@@ -4,8 +4,8 @@
 //! ```text
 //! colour = Σ_k Y_k(d / |d|) coefficient_k
 //! ```
-//! Real basis in homogeneous form, `(degree + 1)²` functions; the zero direction stays zero and
-//! takes no gradient. The gradient of the coefficients is summed over cameras inside one unit.
+//! Real basis in homogeneous form, `(degree + 1)²` functions. The zero direction stays zero and
+//! gets no gradient. Gradients of coefficients are summed over cameras inside one unit.
 //!
 //! Floor per Gaussian and camera, with K = `(degree + 1)²`: 12 bytes of direction and 12 K of
 //! coefficients read, 12 written, about 9 K operations. Gradients: 24 bytes and 12 K read, 12 and
@@ -28,7 +28,7 @@ const C3_XZZ: f32 = SH_C3[2] as f32;
 const C3_ZZZ: f32 = SH_C3[3] as f32;
 const C3_ZXX: f32 = SH_C3[4] as f32;
 
-/// `degree`, cut to [`SH_DEGREE_MAX`] and to what so many coefficients are enough for.
+/// `degree`, limited to [`SH_DEGREE_MAX`] and to the stored coefficients.
 pub(crate) fn usable_degree(degree: usize, stored: usize) -> usize {
     let mut degree = degree.min(SH_DEGREE_MAX);
     while degree > 0 && sh_coefficient_count(degree) > stored {
@@ -67,7 +67,7 @@ pub(crate) fn basis(d: Vec3, y: &mut Array<f32>, #[comptime] degree: usize) {
     }
 }
 
-/// h = Σ_k g_k ∇Y_k(d), the gradients of [`basis`] term by term.
+/// h = Σ_k g_k ∇Y_k(d), the gradients of [`basis`], term by term.
 #[cube]
 fn basis_vjp(d: Vec3, g: &Array<f32>, #[comptime] degree: usize) -> Vec3 {
     let Vec3 { x, y, z } = d;
@@ -105,8 +105,8 @@ fn basis_vjp(d: Vec3, g: &Array<f32>, #[comptime] degree: usize) -> Vec3 {
     Vec3::new(gx, gy, gz)
 }
 
-/// The gradient of d, given those `g` of the functions of v = d/|d|: (h - v (v · h)) / |d|, h as in
-/// [`basis_vjp`].
+/// Gradient of d, from the gradients `g` of the functions of v = d/|d|: (h - v (v · h)) / |d|, with
+/// h as in [`basis_vjp`].
 #[cube]
 pub(crate) fn direction_vjp(
     v: Vec3,
@@ -118,8 +118,8 @@ pub(crate) fn direction_vjp(
     h.sub(v.scale(v.dot(h))).scale(inverse)
 }
 
-/// `g · coefficient`. A channel without gradient (black, and clamped there) does not look at its
-/// coefficient, which may be infinite.
+/// `g · coefficient`, ignoring the coefficient, which may be infinite, of a channel without
+/// gradient (black, and clamped there).
 #[cube]
 pub(crate) fn guarded_dot(g: Vec3, coefficient: Vec3) -> f32 {
     select(g.x == 0.0f32, 0.0f32, g.x * coefficient.x)
@@ -127,7 +127,7 @@ pub(crate) fn guarded_dot(g: Vec3, coefficient: Vec3) -> f32 {
         + select(g.z == 0.0f32, 0.0f32, g.z * coefficient.z)
 }
 
-/// 1 / |d|, and 0 for the zero direction. By way of d / max|dᵢ|, so that the squares neither
+/// 1 / |d|, or 0 for the zero direction. Computed from d / max|dᵢ|, so that the squares neither
 /// overflow nor underflow.
 #[cube]
 pub(crate) fn inverse_length(d: Vec3) -> f32 {
@@ -170,9 +170,9 @@ fn sh_forward(
     }
 }
 
-/// Colours [C, N, 3] for coefficients [N, `stored`, 3] and directions [C, N, 3] of any length.
-/// Coefficients beyond `(degree + 1)²` are not read; `degree` is cut to [`SH_DEGREE_MAX`] and to
-/// what is stored.
+/// Colours [C, N, 3] from coefficients [N, `stored`, 3] and directions [C, N, 3] of any length.
+/// Coefficients beyond `(degree + 1)²` are not read; `degree` is limited to [`SH_DEGREE_MAX`] and
+/// to the stored coefficients.
 pub fn evaluate(
     client: &Client,
     coefficients: &Buffer,
@@ -234,7 +234,7 @@ fn sh_backward_coefficients(
             let at = (c * gaussians + index) * 3;
             let d = Vec3::load(dirs, at);
             let g = Vec3::load(grad_colors, at);
-            // A splat that is not seen is not evaluated: were it NaN, zero times it would be too.
+            // Splats without a gradient are skipped: zero times NaN would be NaN.
             if g.max_abs() != 0.0f32 {
                 basis(d.scale(inverse_length(d)), &mut y, degree);
                 #[unroll]
@@ -276,8 +276,7 @@ fn sh_backward_dirs(
         let inverse = inverse_length(d);
         let v = d.scale(inverse);
         let first = index % gaussians * stored as usize * 3;
-        // A splat that is not seen is not evaluated: were it NaN, zero times it would be too, and
-        // reach the camera.
+        // Splats without a gradient are skipped: zero times NaN would be NaN, and reach the camera.
         if g.max_abs() != 0.0f32 {
             let mut weights = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
             #[unroll]
@@ -291,8 +290,8 @@ fn sh_backward_dirs(
     }
 }
 
-/// Gradients of the coefficients [N, `stored`, 3] and directions [C, N, 3] for that of the colours
-/// [C, N, 3]; only those that `needs_grad` names.
+/// Gradients of the coefficients [N, `stored`, 3] and directions [C, N, 3], from that of the
+/// colours [C, N, 3]; only those that `needs_grad` names.
 pub fn evaluate_backward(
     client: &Client,
     coefficients: &Buffer,

@@ -1,22 +1,21 @@
-//! Colours of Gaussians in the directions of the cameras, and the vector-Jacobian product (3DGS
-//! section 4).
+//! View-dependent colours, and the vector-Jacobian product (3DGS section 4).
 //!
 //! ```text
 //! colour = max(Σ_k Y_k(d / |d|) coefficient_k + 1/2, 0),   d = mean - centre
 //! ```
-//! A channel below zero takes no gradient, one that is exactly zero does. Directions are made where
-//! they are used. Gradients of Gaussians are summed over cameras inside one unit; those of the
-//! centres by blocks of Gaussians and then over the blocks, in order: no atomics.
+//! A channel below zero gets no gradient; one that is exactly zero does. Directions are computed
+//! where they are used. Gradients of Gaussians are summed over cameras inside one unit; those of
+//! the centres over blocks of Gaussians and then over the blocks, in order and without atomics.
 //!
-//! Gaussians that a camera culled are not evaluated, if the packed splats are given: they are black
-//! and pass nothing on.
+//! If the packed splats are given, Gaussians culled by a camera are not evaluated: they are black
+//! and pass no gradient.
 //!
-//! Floor, with K = `(degree + 1)²`: 12 bytes of mean and 12 K of coefficients read per Gaussian
-//! that a camera sees; for every camera 4 read and 12 written of each Gaussian, and about 9 K + 25
-//! operations of each that it sees. Gradients: 12 + 12 K read of each that is seen, and for every
-//! camera 12 and of each that it sees 4; 12 + 12 K written; for every camera about 24 K + 40
-//! operations of each that it sees. Gradients of centres, if wanted, read and compute that once
-//! more.
+//! Floor, with K = `(degree + 1)²`. Forward: per Gaussian that a camera sees, 12 bytes of mean and
+//! 12 K of coefficients read; per camera and Gaussian, 4 read and 12 written; about 9 K + 25
+//! operations per camera and seen Gaussian. Gradients: 12 + 12 K read per seen Gaussian; per
+//! camera, 12 for each Gaussian and 4 more for each seen one; 12 + 12 K written; about 24 K + 40
+//! operations per camera and seen Gaussian. Gradients of centres, if wanted, read and compute that
+//! once more.
 
 mod backward;
 
@@ -30,7 +29,7 @@ use crate::launch::{Buffer, F16, F32, HalfBuffer, per_element};
 use crate::math::{Vec3, is_below_zero};
 use crate::sh::{basis, inverse_length, usable_degree};
 
-/// Floors of forward and gradient for one camera.
+/// Floors of the forward pass and of the gradient, for one camera.
 pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     let (n, seen) = (sizes.gaussians, sizes.visible);
     let coefficients = 12 * sh_coefficient_count(sizes.degree) as u64;
@@ -46,13 +45,12 @@ pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     ]
 }
 
-/// Coefficients of the higher degrees [N, R, 3], as they are stored. All sums are of single
-/// precision.
+/// Coefficients of the higher degrees [N, R, 3], as stored. Sums are in single precision.
 #[derive(Clone, Debug)]
 pub enum ShRest {
     /// In single precision.
     Exact(Buffer),
-    /// In half precision: half of the bytes, for a relative error of up to 2^-11 each.
+    /// In half precision: half of the bytes, with a relative error of up to 2^-11 each.
     Half(HalfBuffer),
 }
 
@@ -70,15 +68,15 @@ impl ShRest {
 pub struct ShColorInputs {
     /// Coefficients of degree 0 [N, 1, 3].
     pub sh0: Buffer,
-    /// Those of the higher degrees [N, R, 3], if there are any.
+    /// Coefficients of the higher degrees [N, R, 3], if any.
     pub sh_rest: Option<ShRest>,
     /// R.
     pub stored: usize,
     /// World positions [N, 3].
     pub means: Buffer,
-    /// Where the cameras stand [C, 3].
+    /// Camera centres [C, 3].
     pub centers: Buffer,
-    /// Packed splats [C, N, 9], if those that are culled there are to stay without a colour.
+    /// Packed splats [C, N, 9], to skip culled ones.
     pub seen: Option<Buffer>,
 }
 
@@ -99,7 +97,7 @@ impl ShColorInputs {
         usable_degree(degree, 1 + stored)
     }
 
-    /// Packed splats, or something to bind in their place; and whether they are read.
+    /// The packed splats, or a buffer in their place; and whether they are read.
     fn seen(&self) -> (BufferArg, bool) {
         match &self.seen {
             Some(packed) => (packed.arg(), true),
@@ -107,7 +105,7 @@ impl ShColorInputs {
         }
     }
 
-    /// Something to bind in place of coefficients that are not read.
+    /// A buffer in place of coefficients that are not read.
     fn rest(&self) -> (BufferArg, ElemType) {
         match &self.sh_rest {
             Some(ShRest::Exact(values)) => (values.arg(), F32),
@@ -117,7 +115,7 @@ impl ShColorInputs {
     }
 }
 
-/// A Gaussian as a camera sees it: d / |d| and 1 / |d|.
+/// A Gaussian relative to a camera: d / |d| and 1 / |d|.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 struct Sight {
@@ -144,7 +142,7 @@ fn coefficient<R: Float>(rest: &[R], at: usize) -> Vec3 {
     )
 }
 
-/// Whether a camera sees a Gaussian: where nobody asks, it does.
+/// True if a camera sees a Gaussian, or if visibility is not asked for.
 #[cube]
 fn is_seen(packed: &[f32], index: usize, #[comptime] asked: bool) -> bool {
     if comptime!(asked) {
@@ -180,7 +178,7 @@ fn unclamped<R: Float>(
     Vec3::new(red + 0.5f32, green + 0.5f32, blue + 0.5f32)
 }
 
-/// Zero below zero; NaN stays.
+/// Clamps at zero; keeps NaN.
 #[cube]
 fn clamped(value: f32) -> f32 {
     select(is_below_zero(value), 0.0f32, value)
@@ -218,8 +216,8 @@ fn sh_colors_forward<R: Float>(
     }
 }
 
-/// Colours [C, N, 3]. The degree is cut to [`SH_DEGREE_MAX`](splat_core::SH_DEGREE_MAX) and to what
-/// is stored.
+/// Colours [C, N, 3]. The degree is limited to [`SH_DEGREE_MAX`](splat_core::SH_DEGREE_MAX) and to
+/// the stored coefficients.
 pub fn sh_colors(client: &Client, inputs: &ShColorInputs, settings: ShColorSettings) -> Buffer {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
     let colors = Buffer::empty(client, cameras * gaussians * 3);

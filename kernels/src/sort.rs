@@ -1,10 +1,10 @@
 //! Stable least-significant-digit radix sort of (`u32` key, `u32` value) pairs, any length.
 //!
-//! A few bits a pass, three steps each: count the digits of every block, scan the counts digit by
-//! digit over all blocks, move every pair to its place. Where the device has planes of one known
-//! size, ranks come from ballots and a plane's lane d counts digit d in a register: as many digits
-//! as lanes. Elsewhere ranks come from counters of every unit in shared memory, scanned in the
-//! order (digit, unit). Both give the one order that a stable sort has.
+//! Each pass sorts by a few bits, in three steps: count the digits of each block, scan the counts
+//! digit by digit over all blocks, move each pair to its position. On devices with planes of one
+//! known size, ranks come from ballots, and lane d of a plane counts digit d in a register: as many
+//! digits as lanes. Elsewhere, ranks come from per-unit counters in shared memory, scanned in the
+//! order (digit, unit). Both give the unique order of a stable sort.
 //!
 //! Floor per pair and pass: 12 bytes read (the key twice), 8 written.
 
@@ -16,17 +16,17 @@ use crate::planes::plane_size;
 use crate::scan::{cube_exclusive_sum, exclusive_sum};
 use splat_core::TILE_SIDE;
 
-/// Units of a workgroup: 16 counters of each fit well into the 16 KiB of shared memory that every
+/// Units per workgroup: 16 counters each fit well into the 16 KiB of shared memory that every
 /// device has.
 const UNITS: u32 = 128;
 const UNITS_USIZE: usize = UNITS as usize;
-/// Pairs of one unit.
+/// Pairs per unit.
 const ITEMS: usize = 16;
 const BLOCK: usize = UNITS_USIZE * ITEMS;
-/// Bits of a digit without planes.
+/// Bits per digit without planes.
 const SHARED_DIGIT_BITS: usize = 4;
 
-/// How ranks are found.
+/// Ranking method.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 struct Ranking {
     /// Lanes of a plane; 1 without plane operations.
@@ -47,26 +47,25 @@ impl Ranking {
         }
     }
 
-    /// Different digits: with planes as many as lanes.
+    /// Number of digits: as many as lanes with planes.
     fn digits(self) -> usize {
         1 << self.digit_bits()
     }
 
-    /// Parts of a block whose digits are counted apart: planes or units.
+    /// Parts of a block whose digits are counted separately: planes or units.
     fn parts(self) -> usize {
         UNITS_USIZE / self.lanes
     }
 }
 
-/// Which of the bins the pass at `shift` puts `key` in; `mask` leaves out bits that are not to be
-/// sorted by.
+/// Bin of `key` in the pass at `shift`; `mask` excludes bits that are not sorted by.
 #[cube]
 fn digit_of(key: u32, shift: u32, mask: u32) -> u32 {
     (key >> shift) & mask
 }
 
-/// `counts[digit * blocks + block]` = keys of `block` with that digit. `len[at]`: how many pairs
-/// there are, if not more than `most`.
+/// `counts[digit * blocks + block]` = keys of `block` with that digit. `len[at]` is the number of
+/// pairs, limited by `most`.
 #[cube(launch)]
 fn count_digits(
     keys: &[u32],
@@ -98,8 +97,8 @@ fn count_digits(
     }
 }
 
-/// Place in the keys of a unit's item. A unit without a plane takes consecutive pairs; the lanes of
-/// a plane take pairs beside each other.
+/// Position of a unit's item in the keys. Without planes a unit takes consecutive pairs; the lanes
+/// of a plane take adjacent pairs.
 #[cube]
 fn place(item: usize, #[comptime] ranking: Ranking) -> usize {
     let lanes = comptime!(ranking.lanes);
@@ -107,7 +106,7 @@ fn place(item: usize, #[comptime] ranking: Ranking) -> usize {
     CUBE_POS * BLOCK + unit / lanes * (ITEMS * lanes) + item * lanes + unit % lanes
 }
 
-/// The lanes of a plane that have `digit`, given for each of its bits those that have it set.
+/// Lanes of a plane that have `digit`, from the lanes that have each of its bits set.
 #[cube]
 fn lanes_with(digit: u32, ballots: &Array<u32>, valid: u32, #[comptime] bits: usize) -> u32 {
     let mut lanes = valid;
@@ -119,8 +118,8 @@ fn lanes_with(digit: u32, ballots: &Array<u32>, valid: u32, #[comptime] bits: us
     lanes
 }
 
-/// Ranks of a unit's pairs among those of the same digit in its plane, and how often the digit that
-/// is the unit's lane occurs in the plane. All units of a plane must call it together.
+/// Ranks of a unit's pairs among those of the same digit in its plane, and the count in the plane
+/// of the digit equal to the unit's lane. All units of a plane must call it together.
 #[cube]
 fn rank_by_planes(
     keys: &[u32],
@@ -161,15 +160,15 @@ fn rank_by_planes(
             rank += (same & before_high).count_ones();
             more += mine.count_ones();
         }
-        // How often this digit has occurred is known by the lane of that number.
+        // The count of a digit so far is held by the lane of that number.
         ranks[item] = plane_shuffle(counted, digit) + rank;
         counted += more;
     }
     counted
 }
 
-/// Moves every pair to `starts[digit, block]` + its rank among the block's pairs with that digit.
-/// `len[at]`: how many pairs there are, if not more than `most`.
+/// Moves each pair to `starts[digit, block]` plus its rank among the block's pairs with that digit.
+/// `len[at]` is the number of pairs, limited by `most`.
 #[cube(launch)]
 fn scatter(
     keys: &[u32],
@@ -188,11 +187,10 @@ fn scatter(
     let digits = comptime!(ranking.digits());
     let parts = comptime!(ranking.parts());
     let lanes = comptime!(ranking.lanes);
-    // For every digit and part: first how often it occurs there, then how often in the block before
-    // that.
+    // For each digit and part: first the count there, then the count in the block before it.
     let mut before = Shared::new_slice(comptime!(digits * parts));
     let mut shared = Shared::new_slice(UNITS_USIZE);
-    // Occurrences in the block of all lower digits.
+    // Count in the block of all lower digits.
     let mut lower = Shared::new_slice(digits);
     let unit = UNIT_POS as usize;
     let part = unit / lanes;
@@ -216,7 +214,7 @@ fn scatter(
     }
     sync_cube();
 
-    // Scan of all counters: every unit takes some consecutive ones.
+    // Scan of all counters; each unit takes consecutive ones.
     let share = comptime!((digits * parts).div_ceil(UNITS_USIZE));
     let mut sum = 0u32;
     for k in 0..share {
@@ -259,12 +257,12 @@ fn scatter(
     }
 }
 
-/// Bits by which one pass sorts on the client's device.
+/// Bits per pass on the client's device.
 pub fn digit_bits(client: &Client) -> u32 {
     Ranking::new(client).digit_bits() as u32
 }
 
-/// How this device finds ranks, in words.
+/// Ranking method of this device, in words.
 pub fn variant(client: &Client) -> String {
     let ranking = Ranking::new(client);
     let ranks = match ranking.lanes {
@@ -304,8 +302,8 @@ pub fn iota(client: &Client, len: usize) -> Buffer {
     values
 }
 
-/// Sorts the pairs by the lowest `key_bits` bits of their keys, ascending; pairs of equal keys keep
-/// their order. Pairs without a partner (one buffer longer than the other) are dropped.
+/// Sorts the pairs by the lowest `key_bits` bits of their keys, ascending and stably. Pairs without
+/// a partner (one buffer longer than the other) are dropped.
 pub fn sort_pairs(
     client: &Client,
     keys: &Buffer,
@@ -317,8 +315,8 @@ pub fn sort_pairs(
     sort_first_pairs(client, keys, values, (&count, 0), key_bits)
 }
 
-/// Sorts the first pairs, as many as element `count.1` of `count.0` says; what is behind them in
-/// the results is not defined. The host need not know how many they are.
+/// Sorts the first pairs; element `count.1` of `count.0` says how many. Results past them are
+/// undefined. The host need not know the number.
 pub(crate) fn sort_first_pairs(
     client: &Client,
     keys: &Buffer,
@@ -380,13 +378,13 @@ pub(crate) fn sort_first_pairs(
     (keys, values)
 }
 
-/// How many bits the numbers below `count` need.
+/// Bits needed for numbers below `count`.
 pub fn bits_for(count: usize) -> u32 {
     usize::BITS - count.saturating_sub(1).leading_zeros()
 }
 
-/// The bits of a float, changed so that unsigned order is numerical order: negative ones are
-/// flipped whole, the others in the sign only. -0 counts as 0.
+/// The bits of a float, mapped so that unsigned order is numerical order: negative numbers have all
+/// bits flipped, others only the sign. -0 counts as 0.
 #[cube]
 pub(crate) fn ordered_bits(value: f32) -> u32 {
     let mut bits = u32::reinterpret(value);

@@ -1,5 +1,5 @@
-//! Structural similarity of two images (Wang et al. 2004) and its gradient, two launches each: a
-//! separable window along the rows, then down the columns.
+//! Structural similarity of two images (Wang et al. 2004) and its gradient, in two launches each: a
+//! separable window along the rows, then along the columns.
 //!
 //! ```text
 //! S = A C / (B D),  A = 2 mx my + c1,  B = mx² + my² + c1,  C = 2 (p - mx my) + c2,  D = q - mx² - my² + c2
@@ -7,8 +7,7 @@
 //! dL/dx = blur(g dS/dmx) + 2 x blur(g dS/dq) + y blur(g dS/dp)
 //! ```
 //! mx, my, q, p: windowed means of x, y, x² + y², xy. A unit makes eight neighbouring values of
-//! each, so that what it reads serves several of them: with the window of 11, 18 reads instead of
-//! 88.
+//! each, so that each value read serves several: with the window of 11, 18 reads instead of 88.
 //!
 //! Floor per pixel and channel. Forward: 8 bytes read, 4 written, and 16 written to be kept; 2 x 4
 //! x 11 fused multiply-adds. Gradient: 28 bytes read, 4 written; 2 x 3 x 11 fused multiply-adds.
@@ -29,9 +28,9 @@ use crate::launch::{Buffer, per_element};
 pub struct SsimShape {
     /// B, images.
     pub images: usize,
-    /// Pixels.
+    /// Height in pixels.
     pub height: usize,
-    /// Pixels.
+    /// Width in pixels.
     pub width: usize,
     /// D.
     pub channels: usize,
@@ -47,18 +46,17 @@ impl SsimShape {
     }
 }
 
-/// The values that lie behind each other along one axis: `lines` lines of `size`; neighbours are
-/// `stride` apart.
+/// Lines of values along one axis: `lines` lines of `size` values, `stride` apart.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 struct Axis {
     size: u32,
     stride: u32,
-    /// Units along one line: each makes [`RUN`] values.
+    /// Units per line; each makes [`RUN`] values.
     runs: u32,
-    /// All units.
+    /// Total number of units.
     units: u32,
-    /// All values of one field.
+    /// Values of one field.
     len: u32,
 }
 
@@ -131,8 +129,8 @@ pub fn ssim(
     (map, moments)
 }
 
-/// Gradients of both images for the gradient `grad` of S [B, H, W, D]; only those that `needs_grad`
-/// names.
+/// Gradients of both images, from the gradient `grad` of S [B, H, W, D]; only those that
+/// `needs_grad` names.
 pub fn ssim_vjp(
     client: &Client,
     images: [&Buffer; 2],

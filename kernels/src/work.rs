@@ -1,5 +1,5 @@
-//! Counters of what the kernels of this crate did: launches, memory, waits. For benchmarks;
-//! counting costs one atomic addition each.
+//! Counters of kernel work: launches, memory, waits. For benchmarks; each count costs one atomic
+//! addition.
 
 use std::sync::atomic::{AtomicU64, Ordering::Relaxed};
 
@@ -8,8 +8,8 @@ static RESERVED: AtomicU64 = AtomicU64::new(0);
 static WAITS: AtomicU64 = AtomicU64::new(0);
 static INTERSECTIONS: AtomicU64 = AtomicU64::new(0);
 
-/// Totals since the process began, over all threads and devices. What a step did is a difference of
-/// two:
+/// Totals since the start of the process, over all threads and devices. Subtract two to measure a
+/// step:
 ///
 /// ```
 /// let before = splat_kernels::work();
@@ -19,20 +19,19 @@ static INTERSECTIONS: AtomicU64 = AtomicU64::new(0);
 /// ```
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Work {
-    /// Kernels of this crate that were launched (those of Burn and CubeCL itself are not seen
-    /// here).
+    /// Launches of this crate's kernels; those of Burn and CubeCL are not counted.
     pub launches: u64,
-    /// Bytes of device memory that were reserved for results and scratch; the device's pool may
-    /// hand out the same bytes many times.
+    /// Bytes of device memory reserved for results and scratch; the device's pool may hand out the
+    /// same bytes many times.
     pub reserved_bytes: u64,
-    /// How often the host waited for the device.
+    /// Times that the host waited for the device.
     pub waits: u64,
-    /// Intersections of splats and tiles that were listed.
+    /// Intersections listed, each of a splat and a tile.
     pub intersections: u64,
 }
 
 impl Work {
-    /// The difference to `earlier`.
+    /// Work done after `earlier`.
     #[must_use]
     pub fn since(self, earlier: Self) -> Self {
         Self {

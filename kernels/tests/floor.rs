@@ -1,4 +1,4 @@
-//! The floor of a step is what the shapes of its tensors say.
+//! The floor of a step equals the sum over the shapes of its tensors.
 
 use splat_kernels::floor::{Bytes, Sizes, step};
 
@@ -18,7 +18,7 @@ fn total(sizes: &Sizes) -> u64 {
     step(sizes).iter().map(|(_, bytes)| bytes.total()).sum()
 }
 
-/// From the shapes of the tensors: what a stage is given and what it leaves.
+/// Computed from the shapes of each stage's inputs and results.
 #[test]
 fn floors_are_the_bytes_of_inputs_and_results() {
     let (n, seen, i, pixels) = (1000, 700, 3000, 160 * 128);
@@ -29,45 +29,45 @@ fn floors_are_the_bytes_of_inputs_and_results() {
         written: n * 4 * 9,
     };
     assert_eq!(floors["project"], splats);
-    // Coefficients of degree 3 and means of what is seen, as its extent says; colours of all.
+    // Coefficients of degree 3 and means of seen Gaussians, whose extents tell; colours of all.
     let colours = Bytes {
         read: seen * 4 * (16 * 3 + 3) + n * 4,
         written: n * 4 * 3,
     };
     assert_eq!(floors["colours"], colours);
-    // The same and their gradients, after those of the colours; gradients of all.
+    // The same and their gradients, after the gradients of the colours; gradients of all.
     let colours = Bytes {
         read: n * 4 * 3 + seen * 4 * (16 * 3 + 3 + 1),
         written: n * 4 * (16 * 3 + 3),
     };
     assert_eq!(floors["colours gradient"], colours);
-    // The image and the photo of 8 bits; three derivatives of each value.
+    // The image and the 8-bit photo; three derivatives per value.
     let photometric = Bytes {
         read: pixels * 3 * (4 + 1),
         written: pixels * 3 * 12,
     };
     assert_eq!(floors["photometric"], photometric);
-    // The derivatives and both again; colour and alpha.
+    // The derivatives and both images again; colour and alpha.
     let photometric = Bytes {
         read: pixels * 3 * (12 + 4 + 1),
         written: pixels * 4 * 4,
     };
     assert_eq!(floors["photometric gradient"], photometric);
-    // Log-scales and the logit; then these or their values and what comes back.
+    // Log-scales and the logit; then these or their values, and their gradients.
     let activations = Bytes {
         read: n * 4 * 2 * 4,
         written: n * 4 * 4,
     };
     assert_eq!(floors["activations gradient"], activations);
-    // Gradient, extent along x, two sums; the sums.
+    // Gradient, extent along x, two sums; the updated sums.
     let density = Bytes {
         read: n * 4 * (2 + 1 + 2),
         written: n * 4 * 2,
     };
     assert_eq!(floors["density"], density);
-    // Of an intersection: its number, its slot, six of shape, colour; then its nine sums and again;
-    // of a pixel the gradient of colour and alpha, what is left, what was walked; of a Gaussian all
-    // of its gradients.
+    // Per intersection: its index, its slot, six values of shape, colour; then its nine sums
+    // written and read again. Per pixel: the gradients of colour and alpha, the final
+    // transmittance, the number of splats walked. Per Gaussian: all of its gradients.
     let backward = Bytes {
         read: i * 4 * (2 + 6 + 3) + i * 4 * 9 + pixels * 4 * (4 + 2),
         written: i * 4 * 9 + n * 4 * (9 + 3 + 1),
@@ -107,7 +107,7 @@ fn more_work_is_more_bytes() {
             parameters: 60,
             ..SIZES
         },
-        // Shorter digits are more passes.
+        // Shorter digits take more passes.
         Sizes {
             digit_bits: 4,
             ..SIZES

@@ -1,5 +1,5 @@
-//! Memory, by the allocator's own count, and its bandwidth: in a process of its own, because the
-//! count is of all.
+//! Memory by the allocator's own count, and its bandwidth. A process of its own, as the count is
+//! process-wide.
 
 #[path = "kernels/adapter.rs"]
 mod adapter;
@@ -63,7 +63,7 @@ fn a_picture_keeps_the_bytes_that_are_stated() {
                 "{splats} splats, {room} intersections, {sums:?}: {used} bytes, stated {stated}"
             );
             assert!(room >= state.lists.intersections as u64 && room > 0);
-            // What went with the last launches is still there: so many bytes whatever the sizes.
+            // Memory of the last launches is still held: a fixed number of bytes for any size.
             assert!((stated..stated + 4096).contains(&used));
 
             let before = work().reserved_bytes;
@@ -72,8 +72,8 @@ fn a_picture_keeps_the_bytes_that_are_stated() {
                 &client, &inputs, &state, &image, &frames, &settings, needs_grad,
             );
             let reserved = work().reserved_bytes - before;
-            // Gradients of nine floats of a packed splat, one colour and the opacity; and what
-            // stands for a missing input.
+            // Gradients of nine floats per packed splat, one colour and the opacity; and a
+            // placeholder for a missing input.
             let stated = 44 * splats as u64
                 + Kept::gradient_per_intersection(1, sums) * state.lists.intersections as u64;
             println!("gradient: {reserved} bytes, stated {stated}");
@@ -89,9 +89,9 @@ fn a_copy_has_a_bandwidth() {
     };
     let [small, large] = [1 << 22, 1 << 25].map(|len| copy::bandwidth(&client, len).unwrap());
     println!("{:.2} and {:.2} GB/s", small / 1e9, large / 1e9);
-    // Slower than a disk or faster than any memory: something else was timed.
+    // Slower than a disk or faster than any memory would mean that something else was timed.
     assert!((5e7..1e14).contains(&large), "{large}");
-    // Launches alone take as long for eight times as much.
+    // If only launches were timed, eight times the size would take the same time.
     assert!(large < 4.0 * small, "{small} {large}");
     assert!(copy::bandwidth(&client, 0).is_err());
 }

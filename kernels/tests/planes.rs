@@ -1,5 +1,5 @@
-//! The kernels that use plane operations, by the tests of `kernels/`. A process of its own: the
-//! choice is for all.
+//! The kernels that use plane operations, run through the tests of `kernels/`. A process of its
+//! own, as the choice is process-wide.
 
 #[path = "kernels/adapter.rs"]
 mod adapter;
@@ -13,5 +13,5 @@ mod reference;
 #[path = "kernels/sort.rs"]
 mod sort;
 
-/// Whether kernels use plane operations.
+/// True if kernels use plane operations.
 const PLANES: bool = true;

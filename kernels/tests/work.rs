@@ -1,5 +1,5 @@
-//! What is counted for the whole process, and what depends on calls before: alone in its process,
-//! one after the other.
+//! Tests of process-wide counters, and of effects of earlier calls; they run one after the other in
+//! a process of their own.
 
 #[path = "kernels/adapter.rs"]
 mod adapter;
@@ -23,7 +23,7 @@ fn launches_bytes_and_waits_are_counted() {
     };
     let input = Buffer::from_u32(&client, &[1; 5000]);
     let before = work();
-    // Three blocks: their sums, the sums' own scan, the blocks' scans.
+    // Three blocks: their sums, the scan of the sums, the scans of the blocks.
     let sums = scan::inclusive_sum(&client, &input);
     assert_eq!(sums.read_u32(&client).unwrap()[4999], 5000);
     let expected = Work {
@@ -35,7 +35,7 @@ fn launches_bytes_and_waits_are_counted() {
     assert_eq!(work().since(before), expected);
 }
 
-/// An image of round splats over `reach` tiles each way, and what it took.
+/// Renders round splats over `reach` tiles each way; returns the image and the work done.
 fn render(client: &Client, splats: usize, spread: f32) -> (Vec<f32>, Work) {
     let frames = Frames {
         cameras: 1,
@@ -80,11 +80,11 @@ fn more_intersections_than_there_was_room_for_are_listed_again() {
     println!("{few:?}\n{again:?}\n{at_once:?}");
     assert!(again.intersections > 3 * few.intersections);
     assert!(again.launches > at_once.launches, "nothing was done again");
-    // What was tried with too little room left no trace, and room to spare makes no difference.
+    // A failed attempt with too little room leaves no trace, and spare room makes no difference.
     assert_eq!(first, second);
     let lit = first.chunks(2).filter(|pixel| pixel[1] > 0.1).count();
     assert!(lit > 10_000, "{lit} pixels are lit");
-    // The host waits once a picture.
+    // The host waits once per image.
     assert_eq!([few.waits, again.waits, at_once.waits], [1; 3]);
 }
 
@@ -121,7 +121,7 @@ fn results_take_the_memory_of_what_nothing_else_holds() {
     assert_eq!([held, lengths, views].map(read), [[1.0], [11.0], [8.0]]);
 }
 
-/// Training gives parameters and moments away, so a step of Adam takes no memory at all.
+/// Training gives up ownership of parameters and moments, so a step of Adam allocates nothing.
 #[test]
 fn a_step_of_adam_takes_no_memory_but_for_what_something_else_holds() {
     let Some((_guard, client)) = alone() else {

@@ -1,4 +1,4 @@
-//! How many intersections can be listed, and for how many there is room before they are counted.
+//! Limits on intersections, and the room reserved before they are counted.
 
 use std::collections::HashMap;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -8,23 +8,22 @@ use cubecl::prelude::*;
 
 use super::{Frames, IntersectError};
 
-/// Gradients of one intersection that a 32-bit index reaches however many intersections there are;
-/// more of them only of fewer. The rasteriser keeps as many (`rasterize.rs` checks it).
+/// Floats per intersection for which a 32-bit index always suffices; with more floats, fewer
+/// intersections fit. The rasteriser keeps this many (`rasterize.rs` checks it).
 pub const MAX_SLOT_VALUES: usize = 22;
 
-/// Intersections that can be listed: kernels address memory by 32-bit indices, and the backward
-/// pass keeps up to [`MAX_SLOT_VALUES`] floats per intersection.
+/// Most intersections that can be listed: kernels use 32-bit indices, and the backward pass keeps
+/// up to [`MAX_SLOT_VALUES`] floats per intersection.
 pub const MAX_INTERSECTIONS: u64 = u32::MAX as u64 / MAX_SLOT_VALUES as u64;
 
-/// Intersections that a device can list: each is one number in each of several buffers, whose size
-/// the device limits.
+/// Most intersections that a device can list: each takes one element in each of several buffers,
+/// whose size the device limits.
 pub(super) fn max_intersections(client: &Client) -> u64 {
     let largest_buffer = client.properties().memory.max_page_size;
     MAX_INTERSECTIONS.min(largest_buffer / size_of::<u32>() as u64)
 }
 
-/// The one place that decides how many intersections are too many. Asked before any list is
-/// allocated.
+/// Refuses too many intersections, before any list is allocated. No other place decides this.
 pub(super) fn check_intersections(count: u64, limit: u64) -> Result<usize, IntersectError> {
     match usize::try_from(count) {
         Ok(intersections) if count <= limit => Ok(intersections),
@@ -32,13 +31,13 @@ pub(super) fn check_intersections(count: u64, limit: u64) -> Result<usize, Inter
     }
 }
 
-/// Room for the next lists of one device and image size. Lists of any capacity that suffices are
-/// the same, so that what happened before never changes a result.
+/// Room for the next lists of one device and image size. Lists do not depend on the capacity, so
+/// earlier calls never change a result.
 pub(super) struct Room {
     key: u64,
 }
 
-/// By [`Room::key`]: a decaying maximum of the numbers found.
+/// Decaying maximum of recent intersection counts, by [`Room::key`].
 static LATELY: LazyLock<Mutex<HashMap<u64, usize>>> = LazyLock::new(Mutex::default);
 
 impl Room {
@@ -55,7 +54,7 @@ impl Room {
             .unwrap_or_else(|poisoned| poisoned.into_inner())
     }
 
-    /// Somewhat more than lately; `None` before the first call.
+    /// Somewhat more than the recent maximum; `None` before the first call.
     pub(super) fn expected(&self) -> Option<usize> {
         let lately = *Self::lately().get(&self.key)?;
         (lately > 0).then(|| (lately + lately / 4).min(MAX_INTERSECTIONS as usize))

@@ -6,18 +6,18 @@ use splat_core::{PROJECTED_EXTENT, PROJECTED_WIDTH};
 use super::{Grid, TILE};
 use crate::math::is_finite;
 
-/// The part of a splat that can be seen: the ellipse sigma <= `cut`.
+/// The visible part of a splat: the ellipse sigma <= `cut`.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(crate) struct Footprint {
-    /// Whether there is one, of finite size.
+    /// True if the ellipse exists and is of finite size.
     seen: bool,
     mean_x: f32,
     mean_y: f32,
     w11: f32,
     w21: f32,
     w22: f32,
-    /// ln(opacity / alpha_min), a little widened: rounding must never drop a pixel.
+    /// ln(opacity / alpha_min), slightly widened so that rounding never drops a pixel.
     cut: f32,
     /// Half size of the ellipse's bounding box.
     half_x: f32,
@@ -61,7 +61,7 @@ impl Footprint {
         }
     }
 
-    /// Whether the ellipse meets the rectangle of the centres of pixels `x..end_x`, `y..end_y`.
+    /// True if the ellipse meets the rectangle of the centres of pixels `x..end_x`, `y..end_y`.
     pub fn touches(self, x: u32, end_x: u32, y: u32, end_y: u32) -> bool {
         let dx0 = x as f32 + 0.5f32 - self.mean_x;
         let dy0 = y as f32 + 0.5f32 - self.mean_y;
@@ -87,8 +87,8 @@ impl Footprint {
         (!beside && !above) || hit_x || hit_y
     }
 
-    /// A lower bound of sigma at (dx, dy) from the mean, below its rounding error for long and thin
-    /// splats.
+    /// Lower bound of sigma at (dx, dy) from the mean, lower by its rounding error for long and
+    /// thin splats.
     fn sigma_below(self, dx: f32, dy: f32) -> f32 {
         let z1 = self.w11 * dx;
         let along = self.w21 * dx;
@@ -99,7 +99,7 @@ impl Footprint {
     }
 }
 
-/// The footprint of a splat, as it is in memory.
+/// Loads the footprint of a splat.
 #[cube]
 pub(super) fn footprint(
     packed: &[f32],
@@ -121,8 +121,8 @@ pub(super) fn footprint(
     f
 }
 
-/// First tile and end of those that the interval mean +- half reaches, of `count` in a row or
-/// column; half a pixel and one part in 10,000 of slack.
+/// Range of tiles that the interval mean +- half reaches, of `count` in a row or column, with a
+/// slack of half a pixel and one part in 10,000.
 #[cube]
 fn tile_range(mean: f32, half: f32, count: u32) -> (u32, u32) {
     let reach = half * 1.0001f32 + 0.5f32;
@@ -136,14 +136,14 @@ fn tile_range(mean: f32, half: f32, count: u32) -> (u32, u32) {
     )
 }
 
-/// The tiles that a splat may touch: a rectangle.
+/// Tiles that a splat may touch: a rectangle.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(super) struct Reach {
     x: u32,
     y: u32,
     columns: u32,
-    /// Tiles of the box; none if the splat is not seen.
+    /// Number of tiles of the box; zero if the splat is not visible.
     pub tiles: u32,
 }
 

@@ -1,4 +1,4 @@
-//! The kernels that make the lists.
+//! Kernels that build the lists.
 
 use cubecl::prelude::*;
 use splat_core::{PROJECTED_DEPTH, PROJECTED_WIDTH};
@@ -9,10 +9,10 @@ use crate::launch::{CUBE_UNITS, CUBE_UNITS_USIZE};
 use crate::scan::cube_exclusive_sum;
 use crate::sort::ordered_bits;
 
-/// Most tiles in the bounding box of a splat whose tiles are tried by one unit.
+/// Most tiles in the bounding box of a splat that a single unit tests.
 const WIDE: u32 = 64;
 
-/// 1 for every visible splat: one whose bounding box meets its image.
+/// 1 for each visible splat, whose bounding box meets the image.
 #[cube(launch)]
 pub(super) fn find_visible(packed: &[f32], opacities: &[f32], visible: &mut [u32], grid: Grid) {
     let splat = ABSOLUTE_POS;
@@ -26,7 +26,7 @@ pub(super) fn find_visible(packed: &[f32], opacities: &[f32], visible: &mut [u32
     }
 }
 
-/// Depth keys and indices of the visible splats, in the order of their index.
+/// Depth keys and indices of the visible splats, in index order.
 #[cube(launch)]
 pub(super) fn pack_visible(
     packed: &[f32],
@@ -45,7 +45,7 @@ pub(super) fn pack_visible(
     }
 }
 
-/// An intersection in its slot, unless the slot is another splat's.
+/// Writes an intersection to its slot, unless the slot belongs to another splat.
 #[cube]
 fn emit_intersection(
     keys: &mut [u32],
@@ -64,7 +64,7 @@ fn emit_intersection(
 }
 
 /// Counting and emitting are two compilations of one function. Should a compiler round them
-/// differently, the slots left over go to no tile.
+/// differently, leftover slots go to no tile.
 #[cube]
 fn emit_nothing(
     keys: &mut [u32],
@@ -82,7 +82,7 @@ fn emit_nothing(
     }
 }
 
-/// The tiles of a splat, tried by one unit; see [`walk_tiles`].
+/// Tests the tiles of a splat with one unit; see [`walk_tiles`].
 #[cube]
 fn walk_narrow(
     f: Footprint,
@@ -121,7 +121,7 @@ fn walk_narrow(
     }
 }
 
-/// The tiles of a splat, tried by all units of the workgroup; see [`walk_tiles`].
+/// Tests the tiles of a splat with all units of the workgroup; see [`walk_tiles`].
 #[cube]
 fn walk_wide(
     f: Footprint,
@@ -174,9 +174,9 @@ fn walk_wide(
     }
 }
 
-/// Tiles touched by the j-th splat of `order`. Counting: `offsets[j]` = their number, 0 behind the
-/// last splat. Emitting: their keys (tile index over all cameras), slots and splats, from slot
-/// `offsets[j]` on; none from slot `capacity` on.
+/// Tiles touched by the j-th splat of `order`. When counting, `offsets[j]` is their number, and 0
+/// past the last splat. When emitting, writes their keys (tile index over all cameras), slots and
+/// splats from slot `offsets[j]` on, up to slot `capacity`.
 #[cube(launch)]
 pub(super) fn walk_tiles(
     packed: &[f32],
@@ -191,7 +191,7 @@ pub(super) fn walk_tiles(
     capacity: u32,
     #[comptime] emit: bool,
 ) {
-    // The wide splats of the workgroup and the tiles of their boxes.
+    // Wide splats of the workgroup and the tiles of their boxes.
     let mut wide = Shared::new_slice(CUBE_UNITS_USIZE);
     let mut wide_tiles = Shared::new_slice(CUBE_UNITS_USIZE);
     let mut wide_count = Shared::new_slice(1usize);
@@ -234,7 +234,7 @@ pub(super) fn walk_tiles(
     if UNIT_POS == 0 {
         wide_count[0] = count;
     }
-    // One after the other, each by all units.
+    // Wide splats one by one, each by all units.
     let count = workgroup_uniform_load(&wide_count[0]);
     for entry in 0..count {
         let j = workgroup_uniform_load(&wide[entry as usize]) as usize;
@@ -260,7 +260,7 @@ pub(super) fn walk_tiles(
     }
 }
 
-/// First position in the ascending `keys` whose key is not less than `key`.
+/// First position in the ascending `keys` whose key is at least `key`.
 #[cube]
 fn lower_bound(keys: &[u32], len: u32, key: u32) -> u32 {
     let mut low = 0u32;
@@ -276,13 +276,13 @@ fn lower_bound(keys: &[u32], len: u32, key: u32) -> u32 {
     low
 }
 
-/// Intersections, of which the device knows `counted[at]` and there is room for `capacity`.
+/// Number of intersections: `counted[at]` on the device, limited by `capacity`.
 #[cube]
 fn intersections_listed(counted: &[u32], at: u32, capacity: u32) -> u32 {
     min(counted[at as usize], capacity)
 }
 
-/// Range of intersections of every tile, empty ones too.
+/// Range of intersections of every tile, including empty ones.
 #[cube(launch)]
 pub(super) fn tile_ranges(
     keys: &[u32],
@@ -300,7 +300,7 @@ pub(super) fn tile_ranges(
     }
 }
 
-/// `out[i] = table[indices[i]]` for every intersection.
+/// `out[i] = table[indices[i]]` for each intersection.
 #[cube(launch)]
 pub(super) fn gather(
     indices: &[u32],

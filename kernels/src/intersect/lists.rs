@@ -8,8 +8,8 @@ use crate::launch::{Buffer, per_element};
 use crate::scan::{PendingTotal, exclusive_sum, exclusive_sum_with_total};
 use crate::sort::{bits_for, sort_first_pairs};
 
-/// The visible splats in order, and where their slots begin: all that is known before there is
-/// memory for intersections.
+/// The visible splats in order, and the starts of their slots: everything known before memory for
+/// intersections is reserved.
 pub(super) struct Counted<'a> {
     packed: &'a Buffer,
     opacities: &'a Buffer,
@@ -94,7 +94,8 @@ impl<'a> Counted<'a> {
         }
     }
 
-    /// The lists, if there are at most `capacity` intersections; `intersections` is that capacity.
+    /// Builds the lists, for at most `capacity` intersections. `intersections` of the result is the
+    /// capacity.
     pub(super) fn list(&self, client: &Client, capacity: usize) -> TileLists {
         let tiles = self.frames.tiles();
         let at = self.frames.splats() as u32;

@@ -1,4 +1,4 @@
-//! Small algebra for kernels. Methods instead of operators: `#[cube]` expands method calls.
+//! Small algebra for kernels. Methods instead of operators, because `#[cube]` expands method calls.
 
 mod guard;
 mod mat;

@@ -77,7 +77,7 @@ impl Quat {
         }
     }
 
-    /// q / |q|, by way of q / max|qᵢ| so that the squares neither overflow nor underflow.
+    /// q / |q|, computed from q / max|qᵢ| so that the squares neither overflow nor underflow.
     pub fn normalize(self) -> Quat {
         let scaled = self.div(self.max_abs());
         scaled.div(f32::sqrt(scaled.dot(scaled)))
@@ -127,8 +127,8 @@ impl Quat {
         }
     }
 
-    /// Vector-Jacobian product of [`Quat::normalize`], of the unit quaternion `self` = q / |q|:
-    /// (g - self (self · g)) / |q|.
+    /// Vector-Jacobian product of [`Quat::normalize`] at the unit quaternion `self` = q / |q|: (g -
+    /// self (self · g)) / |q|.
     pub fn normalize_vjp(self, length: f32, grad: Quat) -> Quat {
         let radial = self.dot(grad);
         Quat {

@@ -1,4 +1,4 @@
-//! Vectors of three.
+//! Three-component vectors.
 
 use cubecl::prelude::*;
 
@@ -66,7 +66,7 @@ impl Vec3 {
         }
     }
 
-    /// Component by component.
+    /// Component-wise product.
     pub fn mul(self, other: Vec3) -> Vec3 {
         Vec3 {
             x: self.x * other.x,
@@ -80,7 +80,7 @@ impl Vec3 {
         self.x * other.x + self.y * other.y + self.z * other.z
     }
 
-    /// Vector product.
+    /// Cross product.
     pub fn cross(self, other: Vec3) -> Vec3 {
         Vec3 {
             x: self.y * other.z - self.z * other.y,
@@ -94,7 +94,7 @@ impl Vec3 {
         max(max(f32::abs(self.x), f32::abs(self.y)), f32::abs(self.z))
     }
 
-    /// self / divisor; zero where the divisor is.
+    /// self / divisor; zero if the divisor is zero.
     pub fn over(self, divisor: f32) -> Vec3 {
         let safe = select(divisor == 0.0f32, 1.0f32, divisor);
         Vec3 {
@@ -104,7 +104,7 @@ impl Vec3 {
         }
     }
 
-    /// No component is infinite or NaN.
+    /// True if no component is infinite or NaN.
     pub fn is_finite(self) -> bool {
         is_finite(self.x) && is_finite(self.y) && is_finite(self.z)
     }

@@ -8,7 +8,7 @@ use super::tile::{
 use super::{Sizes, TargetKind};
 use crate::ssim::{RUN, UNROLLED_TAPS, load_window, windowed};
 
-/// The derivatives, windowed, put together with the sign of x - y: the gradient of x; zero for the
+/// Windows the derivatives and combines them with the sign of x - y: the gradient of x; zero for
 /// channels beyond the photo's.
 #[cube(launch)]
 pub(super) fn photometric_gradient(
@@ -34,7 +34,7 @@ pub(super) fn photometric_gradient(
     let channel = place.channel as usize;
     let mut sums = Array::<f32>::new(RUN);
 
-    // Fields lie channel by channel: a plane is an image of one channel.
+    // Fields are stored channel by channel: each plane is an image of one channel.
     let planes = Place {
         exists: place.exists,
         image: place.image * sizes.channels + place.channel,

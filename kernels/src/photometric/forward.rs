@@ -1,4 +1,4 @@
-//! The loss of the tiles, and its means.
+//! The loss of each tile, and the means.
 
 use cubecl::prelude::*;
 
@@ -171,7 +171,7 @@ pub(super) fn photometric_tiles(
     }
 }
 
-/// Both sums over the tiles, in order, times what makes them means. One workgroup.
+/// Sums over the tiles, in order, scaled to means. One workgroup.
 #[cube(launch)]
 pub(super) fn means_of_tiles(partials: &[f32], means: &mut [f32], tiles: u32, l1: f32, ssim: f32) {
     let mut shared = Shared::new_slice(CUBE_UNITS_USIZE);

@@ -5,15 +5,15 @@ use cubecl::prelude::*;
 use super::{Sizes, TargetKind};
 use crate::ssim::{RUN, UNROLLED_TAPS, windowed};
 
-/// Pixels of a tile.
+/// Width of a tile in pixels.
 pub(super) const TILE_WIDTH: usize = 32;
 pub(super) const TILE_HEIGHT: usize = 16;
-/// Floats from a row in shared memory to the next: one more than there are, so that the runs of
-/// several rows are in different banks.
+/// Floats between rows in shared memory: one more than needed, so that the runs of different rows
+/// are in different banks.
 pub(super) const PITCH: usize = TILE_WIDTH + 1;
 /// Runs along a row of a tile.
 pub(super) const RUNS: usize = TILE_WIDTH / RUN;
-/// Units of a workgroup: one makes a run down a column.
+/// Units of a workgroup; each makes a run down a column.
 pub(super) const UNITS: usize = TILE_WIDTH * TILE_HEIGHT / RUN;
 /// mx, my, q, p.
 pub(super) const MOMENTS: usize = 4;
@@ -24,7 +24,7 @@ pub(super) const FIELDS: usize = 3;
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(super) struct Place {
-    /// There may be more workgroups than work.
+    /// False for excess workgroups.
     pub exists: bool,
     pub image: u32,
     pub channel: u32,
@@ -35,7 +35,7 @@ pub(super) struct Place {
 
 #[cube]
 impl Place {
-    /// Channels of a tile lie beside each other, so that they find its pixels in the cache.
+    /// Channels of a tile are adjacent, so that they find its pixels in the cache.
     pub fn new(sizes: Sizes) -> Place {
         let cube = CUBE_POS as u32;
         let tile = cube / sizes.channels;
@@ -50,8 +50,8 @@ impl Place {
         }
     }
 
-    /// Whether a pixel is in the image, and its index over all images; that of some other pixel if
-    /// not. Its place may be shifted by `back` to the left and up, beyond the edge.
+    /// True if a pixel is in the image, with its index over all images (of another pixel if not).
+    /// Its position may be shifted left and up by `back`, beyond the edge.
     pub fn pixel(self, sizes: Sizes, x: u32, y: u32, back: u32) -> (bool, usize) {
         let inside = self.exists
             && x >= back
@@ -63,7 +63,7 @@ impl Place {
     }
 }
 
-/// Value `index` of the photo.
+/// Value number `index` of the photo.
 #[cube]
 pub(super) fn target_value(target: &[u32], index: usize, #[comptime] kind: TargetKind) -> f32 {
     if comptime!(kind == TargetKind::Values) {
@@ -76,7 +76,7 @@ pub(super) fn target_value(target: &[u32], index: usize, #[comptime] kind: Targe
     }
 }
 
-/// Puts a run along row `row` of a field into shared memory.
+/// Stores a run along row `row` of a field in shared memory.
 #[cube]
 pub(super) fn put(
     shared: &mut Shared<[f32]>,
@@ -93,7 +93,7 @@ pub(super) fn put(
     }
 }
 
-/// The run of the unit, windowed down its column of a field.
+/// The unit's run, windowed down its column of a field.
 #[cube]
 pub(super) fn down_column(
     shared: &Shared<[f32]>,

@@ -12,9 +12,9 @@ use crate::math::{Quat, Vec3};
 
 /// Values of a camera's gradient: three rows [W | t], then fx, fy, cx, cy.
 const CAMERA_VALUES: usize = 16;
-/// Gaussians that one unit of the camera gradient sums.
+/// Gaussians summed by one unit of the camera gradient.
 const CAMERA_ITEMS: usize = 4;
-/// Gaussians that one workgroup of the camera gradient sums.
+/// Gaussians summed by one workgroup of the camera gradient.
 const CAMERA_BLOCK: usize = CUBE_UNITS_USIZE * CAMERA_ITEMS;
 
 /// Gradients of Gaussians, summed over cameras.
@@ -141,7 +141,7 @@ fn project_backward_cameras(
         shared[k * CUBE_UNITS_USIZE + unit] = sums[k];
     }
     sync_cube();
-    // 256 units: 16 values, 16 parts of 16 units each; then 16 units add the parts.
+    // 256 units: 16 values with 16 parts each, then 16 units add the parts.
     let mut part = 0.0f32;
     for k in 0..16usize {
         part += shared[unit * 16 + k];
@@ -157,7 +157,7 @@ fn project_backward_cameras(
     }
 }
 
-/// Adds the blocks' partial gradients of every camera, in order. The last row of a view matrix has
+/// Adds the blocks' partial gradients of each camera, in order. The last row of a view matrix has
 /// no influence.
 #[cube(launch)]
 fn sum_camera_partials(
@@ -190,8 +190,8 @@ fn sum_camera_partials(
     }
 }
 
-/// Gradients of means [N, 3], quats [N, 4], scales [N, 3], viewmats [C, 4, 4] and intrinsics [C, 4]
-/// for the gradient of the packed splats [C, N, 9]; only those that `needs_grad` names.
+/// Gradients of means [N, 3], quats [N, 4], scales [N, 3], viewmats [C, 4, 4] and intrinsics [C,
+/// 4], from the gradient of the packed splats [C, N, 9]; only those that `needs_grad` names.
 pub fn project_backward(
     client: &Client,
     inputs: &ProjectInputs,
@@ -208,7 +208,7 @@ pub fn project_backward(
         viewmats: cameras * 16,
         intrinsics: cameras * 4,
     };
-    // A gradient that is not needed still needs something to bind.
+    // A gradient that is not needed still needs a buffer to bind.
     let grads = lens
         .zip(needs_grad)
         .map(|(len, needed)| Buffer::empty(client, if needed { len } else { 1 }));

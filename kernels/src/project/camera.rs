@@ -1,5 +1,5 @@
-//! One camera: how it sees a point, and the vector-Jacobian product of that. Another camera model
-//! replaces this file.
+//! One camera: its projection of a point, and the vector-Jacobian product of that. Another camera
+//! model replaces this file.
 //!
 //! ```text
 //! p = W mean + t = (x, y, z)                      mean2d = (fx x/z + cx, fy y/z + cy)
@@ -23,15 +23,15 @@ pub(super) struct Camera {
     cy: f32,
 }
 
-/// A point as a camera sees it, and the camera linearised there.
+/// A point in a camera, with the camera linearised there.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(super) struct Sight {
-    /// In the camera's axes.
+    /// Position in camera space.
     pub p: Vec3,
     pub mean_x: f32,
     pub mean_y: f32,
-    /// Clamped x/z and y/z, and whether the clamp left them alone.
+    /// Clamped x/z and y/z, and whether they were inside the clamp.
     u: f32,
     v: f32,
     u_inside: bool,
@@ -41,7 +41,7 @@ pub(super) struct Sight {
     pub jw2: Vec3,
 }
 
-/// Gradients of a [`Sight`] that its point and its camera get.
+/// Gradients of the fields of a [`Sight`].
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(super) struct SightGradient {
@@ -52,7 +52,7 @@ pub(super) struct SightGradient {
     pub jw2: Vec3,
 }
 
-/// Gradients of one camera through one point, and of the point.
+/// Gradients of one camera through one point, and of that point.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(super) struct CameraGradient {
@@ -65,7 +65,8 @@ pub(super) struct CameraGradient {
     pub cy: f32,
 }
 
-/// The clamp of x/z (or y/z): the image plus a margin on each side, about the real principal point.
+/// The clamp of x/z (or y/z): the image plus a margin on each side, relative to the actual
+/// principal point.
 #[cube]
 fn clamp_to_view(ratio: f32, focal: f32, centre: f32, size: f32, margin: f32) -> (f32, bool) {
     let low = -(centre + margin * size) / focal;
@@ -116,7 +117,7 @@ impl Camera {
         }
     }
 
-    /// Vector-Jacobian product of [`Camera::sight`] of `mean`.
+    /// Vector-Jacobian product of [`Camera::sight`] at `mean`.
     pub fn sight_vjp(self, mean: Vec3, sight: Sight, g: SightGradient) -> CameraGradient {
         let Sight { p, u, v, .. } = sight;
         // J W = [fx/z (W1 - u W3); fy/z (W2 - v W3)]

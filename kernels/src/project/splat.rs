@@ -29,8 +29,8 @@ impl Gaussian {
     }
 }
 
-/// The 2D covariance with the low-pass filter, by way of V = J W R diag(s), in units of the splat's
-/// own size.
+/// The 2D covariance with the low-pass filter, from V = J W R diag(s), in units of the splat's own
+/// size.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(super) struct Covariance {
@@ -40,7 +40,7 @@ pub(super) struct Covariance {
     pub flat: bool,
     pub v1: Vec3,
     pub v2: Vec3,
-    /// Direction of the minors, not normalised, and its length.
+    /// Direction of the minors, unnormalised.
     pub m: Vec3,
     pub m_norm: f32,
     /// Length of the minors.
@@ -53,10 +53,10 @@ pub(super) struct Covariance {
     pub det: f32,
 }
 
-/// The covariance of a Gaussian of this scale, of the rows of J W R; `blur` = √e in pixels.
+/// Covariance of a Gaussian of this scale, from the rows of J W R; `blur` = √e in pixels.
 #[cube]
 fn covariance(jwr1: Vec3, jwr2: Vec3, scale: Vec3, blur: f32) -> Covariance {
-    // V over its largest entry, `size` pixels.
+    // V divided by its largest entry, `size` pixels.
     let largest_scale = scale.max_abs();
     let relative = scale.over(largest_scale);
     let row1 = jwr1.mul(relative);
@@ -95,11 +95,11 @@ fn covariance(jwr1: Vec3, jwr2: Vec3, scale: Vec3, blur: f32) -> Covariance {
     }
 }
 
-/// Everything that the projection of one Gaussian computes, named as in the formula.
+/// All intermediate values of the projection of one Gaussian, named as in the formula.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(super) struct Splat {
-    /// Not culled. The other fields mean nothing if this is false.
+    /// True if not culled; otherwise the other fields are meaningless.
     pub visible: bool,
     pub sight: Sight,
     /// Unit quaternion.
@@ -152,7 +152,7 @@ pub(super) fn project_splat(g: Gaussian, camera: Camera, s: Uniforms) -> Splat {
         && is_finite(extent_x)
         && is_finite(extent_y);
     let in_depth = s.near <= p.z && p.z <= s.far;
-    // Strict, as `splat_core` says of culling.
+    // Strict comparison, as `splat_core` defines culling.
     let on_screen = mean_x + extent_x > 0.0f32
         && mean_x - extent_x < s.width
         && mean_y + extent_y > 0.0f32

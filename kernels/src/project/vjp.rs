@@ -6,7 +6,7 @@ use super::camera::{Camera, CameraGradient, SightGradient};
 use super::splat::{Covariance, Gaussian, Splat};
 use crate::math::{Mat3, Quat, Vec3};
 
-/// Gradients of one projection to its Gaussian and its camera.
+/// Gradients of one projection, for its Gaussian and its camera.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(super) struct Gradient {
@@ -16,7 +16,7 @@ pub(super) struct Gradient {
     pub scale: Vec3,
 }
 
-/// Gradients of the rows of V, in pixels, for the gradient of a packed splat that begins at `at`.
+/// Gradients of the rows of V, in pixels, from the gradient of a packed splat that begins at `at`.
 #[cube]
 fn covariance_vjp(splat: Splat, grad_packed: &[f32], at: usize) -> (Vec3, Vec3) {
     let Covariance {
@@ -60,7 +60,7 @@ fn covariance_vjp(splat: Splat, grad_packed: &[f32], at: usize) -> (Vec3, Vec3) 
     (g_v1, g_v2)
 }
 
-/// Vector-Jacobian product of [`project_splat`](super::splat::project_splat) for the gradient at
+/// Vector-Jacobian product of [`project_splat`](super::splat::project_splat), from the gradient at
 /// `grad_packed[at..at + 7]` (extents carry none).
 #[cube]
 pub(super) fn project_vjp(

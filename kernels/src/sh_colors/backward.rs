@@ -10,12 +10,12 @@ use crate::math::{Vec3, is_below_zero};
 use crate::reduce::{sum_blocks, sum_units};
 use crate::sh::{basis, direction_vjp, guarded_dot};
 
-/// Gaussians that one unit of the centres' gradient sums.
+/// Gaussians summed by one unit of the centres' gradient.
 const CENTER_ITEMS: usize = 4;
-/// Gaussians that one workgroup of it sums.
+/// Gaussians summed by one workgroup of the centres' gradient.
 const CENTER_BLOCK: usize = CUBE_UNITS_USIZE * CENTER_ITEMS;
 
-/// The gradient of a channel before the clamp: none below zero, unless it `recovers` and descent
+/// The gradient of a channel before the clamp: zero below zero, unless it `recovers` and descent
 /// would raise it.
 #[cube]
 fn passed_on_channel(color: f32, g: f32, #[comptime] recovers: bool) -> f32 {
@@ -36,7 +36,7 @@ fn passed_on(color: Vec3, g: Vec3, #[comptime] recovers: bool) -> Vec3 {
     )
 }
 
-/// The gradient of the direction, given that of the colour before the clamp.
+/// The gradient of the direction, from that of the colour before the clamp.
 #[cube]
 fn sight_vjp<R: Float>(
     rest: &[R],
@@ -47,7 +47,7 @@ fn sight_vjp<R: Float>(
     #[comptime] degree: usize,
 ) -> Vec3 {
     let mut weights = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
-    // The function of degree 0 does not look at the direction.
+    // The function of degree 0 does not depend on the direction.
     weights[0] = 0.0f32;
     let from = gaussian * stored * 3;
     #[unroll]
@@ -94,7 +94,7 @@ fn sh_colors_backward_gaussians<R: Float>(
         for camera in 0..cameras as usize {
             let index = camera * gaussians + gaussian;
             let g = Vec3::load(grad_colors, index * 3);
-            // A splat without a gradient is not evaluated: were it NaN, zero times it would be too.
+            // Splats without a gradient are skipped: zero times NaN would be NaN.
             if g.max_abs() != 0.0f32 && is_seen(packed, index, asked) {
                 let sight = sight(means, centers, gaussian, camera);
                 basis(sight.unit, &mut y, degree);
@@ -168,7 +168,7 @@ fn sh_colors_backward_centers<R: Float>(
             if gaussian < gaussians {
                 let index = camera * gaussians + gaussian;
                 let g = Vec3::load(grad_colors, index * 3);
-                // As above: what is broken and not seen must not reach the camera.
+                // As above: a broken, unseen splat must not reach the camera.
                 if g.max_abs() != 0.0f32 && is_seen(packed, index, asked) {
                     let sight = sight(means, centers, gaussian, camera);
                     let mut values = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
@@ -191,8 +191,8 @@ fn sh_colors_backward_centers<R: Float>(
     }
 }
 
-/// Gradients of sh0 [N, 1, 3], `sh_rest` [N, R, 3], means [N, 3] and centres [C, 3] for that of the
-/// colours [C, N, 3]; only those that `needs_grad` names.
+/// Gradients of sh0 [N, 1, 3], `sh_rest` [N, R, 3], means [N, 3] and centres [C, 3], from that of
+/// the colours [C, N, 3]; only those that `needs_grad` names.
 pub fn sh_colors_backward(
     client: &Client,
     inputs: &ShColorInputs,
@@ -203,7 +203,7 @@ pub fn sh_colors_backward(
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
     let degree = inputs.degree(settings.degree);
     let recovers = settings.clamp_gradient == ClampGradient::Recovering;
-    // A gradient that is not needed still needs something to bind.
+    // A gradient that is not needed still needs a buffer to bind.
     let reserve = |needed, len| Buffer::empty(client, if needed { len } else { 1 });
     let sh0 = reserve(needs_grad.sh0, gaussians * 3);
     let sh_rest = reserve(needs_grad.sh_rest, gaussians * inputs.stored * 3);

@@ -1,20 +1,20 @@
-//! The kernels of structural similarity: along the rows, down the columns, forward and back.
+//! Kernels of structural similarity: along rows and columns, forward and backward.
 
 use cubecl::prelude::*;
 
 use super::Axis;
 
-/// Values along the window's axis that one unit makes.
+/// Values along the window's axis per unit.
 pub(crate) const RUN: usize = 8;
-/// Longest window whose loops are unrolled, so that values stay in registers.
+/// Longest window with unrolled loops, which keep values in registers.
 pub(crate) const UNROLLED_TAPS: usize = 16;
-/// Fields in the memory that the forward keeps: mx, my, q, p.
+/// Fields kept by the forward pass: mx, my, q, p.
 pub(super) const MOMENTS: usize = 4;
 /// Fields whose blur makes a gradient.
 pub(super) const FIELDS: usize = 3;
 
-/// Where a unit works: place of the line's first value, and how far along the line it begins. Units
-/// that lie beside each other take lines that do.
+/// Position of a unit: index of the line's first value, and its start along the line. Adjacent
+/// units take adjacent lines.
 #[cube]
 fn place(axis: Axis, unit: u32) -> (u32, u32) {
     let across = unit % axis.stride;
@@ -27,8 +27,8 @@ fn place(axis: Axis, unit: u32) -> (u32, u32) {
     )
 }
 
-/// Place of the value `ahead` of position `along - radius` of a line, and whether it lies on the
-/// line; the place of its first value if not.
+/// Index of the value `ahead` of position `along - radius` of a line, and whether it lies on the
+/// line; if not, the index of the line's first value.
 #[cube]
 fn neighbour(axis: Axis, first: u32, along: u32, ahead: u32, radius: u32) -> (usize, bool) {
     let shifted = along + ahead;
@@ -130,7 +130,7 @@ pub(super) fn moments_along_rows(
     }
 }
 
-/// One field, windowed down the columns.
+/// One field, windowed along the columns.
 #[cube]
 fn down_columns(
     field: &[f32],
@@ -175,7 +175,7 @@ pub(crate) fn terms(mx: f32, my: f32, q: f32, p: f32, c1: f32, c2: f32) -> Terms
     }
 }
 
-/// The moments, windowed down the columns too, and S.
+/// Windows the moments along the columns too, and computes S.
 #[cube(launch)]
 pub(super) fn similarity_down_columns(
     rows: &[f32],
@@ -234,7 +234,7 @@ pub(super) fn similarity_down_columns(
 }
 
 /// g dS/dmean of the own image, g dS/dq and g dS/dp, windowed along the rows. `own` and `other`:
-/// first value of the means of the image whose gradient it is, and of the other one.
+/// first value of the means of the image whose gradient it is, and of the other image.
 #[cube(launch)]
 pub(super) fn fields_along_rows(
     moments: &[f32],
@@ -295,7 +295,7 @@ pub(super) fn fields_along_rows(
     }
 }
 
-/// The fields, windowed down the columns too, put together: the gradient of `own`.
+/// Windows the fields along the columns too, and combines them: the gradient of `own`.
 #[cube(launch)]
 pub(super) fn gradient_down_columns(
     rows: &[f32],

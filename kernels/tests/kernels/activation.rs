@@ -1,11 +1,11 @@
-//! The exponential and the logistic function against float64.
+//! The exponential and the logistic function, compared with float64.
 
 use splat_core::Activation;
 use splat_kernels::activation::{activate, activate_vjp};
 
 use crate::device::{client, download, upload};
 
-/// Values and gradients for gradients of 2.
+/// Values, and gradients from an upstream gradient of 2.
 fn run(values: &[f32], function: Activation) -> Option<[Vec<f32>; 2]> {
     let client = client()?;
     let x = upload(&client, values);

@@ -1,4 +1,4 @@
-//! A step of Adam of the rows that were seen, bit for bit against a step of all rows.
+//! A step of Adam on seen rows equals a step on all rows, bit for bit.
 
 use cubecl::client::Client;
 use splat_core::{AdamRows, AdamStep};
@@ -24,7 +24,7 @@ struct Values {
 }
 
 impl Values {
-    /// Rows of `width`; every third has no gradient, and the first few are odd.
+    /// Rows of `width`; every third has no gradient, and the first few have special values.
     fn new(rows: usize, width: usize) -> Self {
         let mut rng = rng(36);
         let len = rows * width;
@@ -37,12 +37,12 @@ impl Values {
             f32::INFINITY,
             f32::NEG_INFINITY,
             -0.0,
-            // The smallest number but zero, and one whose square is not finite.
+            // The smallest non-zero number, and one whose square is not finite.
             f32::from_bits(1),
             -1e30,
             1.0,
         ];
-        // In the last place of a row, so that a row is looked at to its end.
+        // In the last position of a row, so that rows are read to their ends.
         for (row, value) in grad.chunks_mut(width).zip(odd) {
             row.fill(0.0);
             row[width - 1] = value;
@@ -62,8 +62,8 @@ impl Values {
         [&self.param, &self.moments[0], &self.moments[1]]
     }
 
-    /// After a step, as bits; `held` keeps what went in from being overwritten, and must stay what
-    /// it was.
+    /// Results of a step, as bits. `held` keeps inputs from being overwritten; they must stay
+    /// unchanged.
     fn after(&self, client: &Client, rows: AdamRows, held: [bool; 3]) -> [Vec<u32>; 3] {
         let step = AdamStep { rows, ..STEP };
         let before = self.before().map(|values| upload(client, values));
@@ -99,7 +99,7 @@ fn bits(values: &[f32]) -> Vec<u32> {
 fn seen_rows_are_stepped_as_all_are_and_the_others_keep_every_bit() {
     let Some(client) = client() else { return };
     let nobody = [false; 3];
-    // Less than a workgroup, many of them, and rows that a workgroup's units do not divide, or do
+    // Less than a workgroup, many workgroups, and rows that a workgroup's units do not divide or do
     // not cover.
     for (rows, width) in [
         (7, 1),

@@ -1,4 +1,4 @@
-//! The adapter that tests run on.
+//! The adapter for tests.
 
 use std::sync::OnceLock;
 
@@ -11,10 +11,10 @@ use cubecl::wgpu::{
 };
 use splat_kernels::MOST_BUFFERS;
 
-/// A client of the default wgpu adapter, software ones included; `None`, loudly, where there is
-/// none. With WGSL it binds as few buffers as the kernels say they can do with.
+/// A client of the default wgpu adapter, software ones included. Prints a message and returns
+/// `None` if there is none. With WGSL it binds only as many buffers as the kernels claim to need.
 pub fn find() -> Option<Client> {
-    // A process can open it once.
+    // A process can open the device only once.
     static CLIENT: OnceLock<Option<Client>> = OnceLock::new();
     CLIENT
         .get_or_init(|| {
@@ -30,7 +30,7 @@ fn open() -> Option<Client> {
         Some((device, setup.ok()?))
     })?;
     let client = cubecl::Device::Wgpu(device).client();
-    // SPIR-V and MSL need a device that only CubeCL can open.
+    // SPIR-V and MSL need a device that CubeCL opens itself.
     if client.name() != "wgpu<wgsl>" {
         return Some(client);
     }
@@ -44,7 +44,7 @@ fn with_few_bindings(mut setup: WgpuSetup) -> WgpuDevice {
             .features()
             .difference(Features::all_experimental_mask()),
         required_limits: Limits {
-            // One is CubeCL's own, for lengths and scalars.
+            // One buffer is CubeCL's own, for lengths and scalars.
             max_storage_buffers_per_shader_stage: MOST_BUFFERS + 1,
             ..setup.device.limits()
         },

@@ -1,4 +1,4 @@
-//! For what is counted for the whole process: one test after the other.
+//! Serialises tests of process-wide counters.
 
 use std::sync::{Mutex, MutexGuard, PoisonError};
 

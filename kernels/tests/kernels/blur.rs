@@ -1,4 +1,4 @@
-//! The separable window.
+//! Tests of the separable window.
 
 use splat_kernels::blur::blur;
 

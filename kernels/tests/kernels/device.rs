@@ -1,17 +1,18 @@
-//! The device the tests run on, and small helpers.
+//! The device for tests, and helpers.
 
 use cubecl::client::Client;
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg32;
 use splat_kernels::Buffer;
 
-/// A client of the default wgpu adapter, software ones included, of which kernels take the way that
-/// this test program is about: with planes or without. `None`, loudly, where there is no adapter.
+/// A client of the default wgpu adapter, software ones included, with kernels forced to the variant
+/// of this test program: with planes or without. Prints a message and returns `None` if there is no
+/// adapter.
 pub fn client() -> Option<Client> {
     let client = crate::adapter::find()?;
     splat_kernels::force_plane_size(Some(0));
     if crate::PLANES {
-        // Software devices are not asked whether they have planes, but may.
+        // Software devices do not report planes, but may have them.
         let hardware = &client.properties().hardware;
         let size = hardware.plane_size_max;
         if let Ok(required) = std::env::var("SPLAT_REQUIRE_PLANES") {

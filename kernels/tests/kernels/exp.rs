@@ -1,4 +1,4 @@
-//! Our own exponential.
+//! Tests of the exponential.
 
 use splat_kernels::exp::exp2_neg_each;
 

@@ -1,4 +1,4 @@
-//! Tile lists against brute force over pixels.
+//! Tile lists, compared with brute force over pixels.
 
 use rand::RngExt;
 use splat_kernels::intersect::{Frames, TILE, TileLists, intersect};
@@ -35,7 +35,7 @@ fn random_rows(splats: usize, seed: u64) -> (Vec<f32>, Vec<f32>) {
     let mut packed = Vec::new();
     let mut opacities = Vec::new();
     for i in 0..splats {
-        // Round ones, long ones, and needles of 1000 x 0.1 and 10,000 x 1 pixels.
+        // Round splats, long ones, and needles of 1000 x 0.1 and 10,000 x 1 pixels.
         let (a, b) = match i % 4 {
             0 => (rng.random_range(0.1..8.0), rng.random_range(0.1..8.0)),
             1 => (rng.random_range(10.0..60.0), rng.random_range(0.1..3.0)),
@@ -44,7 +44,7 @@ fn random_rows(splats: usize, seed: u64) -> (Vec<f32>, Vec<f32>) {
         };
         let x = rng.random_range(-30.0f32..150.0);
         let y = rng.random_range(-30.0f32..110.0);
-        // Few depths: many ties; negative ones, both zeros, and two that are neighbours in f32.
+        // Few depths, for many ties: negative ones, both zeros, and two neighbouring f32 numbers.
         let depth = [-3.5f32, -0.0, 0.0, 1.0, 1e4, 1e4 + 0.001][rng.random_range(0..6)];
         packed.extend(row(
             x,
@@ -143,7 +143,7 @@ fn splats_over_many_tiles_are_listed_by_all_units_together() {
         height: 330,
         alpha_min: ALPHA_MIN,
     };
-    // Every tenth is large: most of the picture, a disc over a few hundred tiles, or a needle
+    // Every tenth splat is large: most of the image, a disc over a few hundred tiles, or a needle
     // across it.
     let mut rng = rng(23);
     let (mut packed, mut opacities) = (Vec::new(), Vec::new());
@@ -293,7 +293,7 @@ fn nothing_to_see_gives_empty_lists() {
     };
     assert_eq!(none.intersections, 0);
     assert_eq!(tiles, vec![Vec::<u32>::new(); 6]);
-    // All culled, all too faint, and not a number.
+    // All culled, all too faint, and all NaN.
     let frames = Frames {
         gaussians: 3,
         ..frames

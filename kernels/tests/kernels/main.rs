@@ -1,6 +1,5 @@
-//! The kernels against the standard library and plain float64 references, on whatever wgpu adapter
-//! is there. Those that can use plane operations do without them here; `planes.rs` beside this has
-//! the others.
+//! The kernels, compared with the standard library and plain float64 references on the wgpu adapter
+//! found. Kernels that can use plane operations do without them here; `planes.rs` tests the others.
 
 mod activation;
 mod adam;
@@ -18,5 +17,5 @@ mod sh;
 mod sh_colors;
 mod sort;
 
-/// Whether kernels use plane operations.
+/// True if kernels use plane operations.
 const PLANES: bool = false;

@@ -1,4 +1,4 @@
-//! The photometric loss against its definition in float64, however the photo lies in memory.
+//! The photometric loss, compared with its definition in float64, for every photo layout.
 
 use cubecl::client::Client;
 use rand::RngExt;
@@ -25,7 +25,7 @@ fn shape([images, height, width]: [usize; 3], channels: usize, pixel: usize) -> 
     }
 }
 
-/// The mean absolute difference, and one less the mean similarity, from the definition.
+/// The mean absolute difference and one minus the mean similarity, from the definition.
 fn reference(rendered: &[f64], photo: &[f64], shape: &PhotometricShape) -> [f64; 2] {
     let (h, w) = (shape.height as isize, shape.width as isize);
     let margin = if h < 5 || w < 5 { 0 } else { 2 };
@@ -96,7 +96,7 @@ fn run(
 fn photos_of_any_kind_give_the_means_and_the_gradient_of_the_definition() {
     let Some(client) = client() else { return };
     let mut rng = rng(80);
-    // Less than a tile and several of them, and an image smaller than the window.
+    // Less than a tile, several tiles, and an image smaller than the window.
     for (size, channels, pixel) in [([1, 6, 7], 1, 1), ([2, 4, 9], 3, 4), ([1, 18, 34], 2, 4)] {
         let shape = shape(size, channels, pixel);
         let pixels: usize = size.iter().product();
@@ -142,8 +142,8 @@ fn photos_of_any_kind_give_the_means_and_the_gradient_of_the_definition() {
         let wide: Vec<f64> = rendered.iter().map(|x| f64::from(*x)).collect();
         assert_close("means", &means, &reference(&wide, &photo, &shape), 2e-6);
         let d_ssim = |x: &[f64]| reference(x, &photo, &shape)[1];
-        // The absolute value has no slope where both are equal: one over the number of values
-        // elsewhere.
+        // The absolute value has no slope where both images are equal; elsewhere it is one over the
+        // number of values.
         let mut expected = differences(&wide, 1e-5, |x| -1.3 * d_ssim(x));
         for (i, value) in expected.iter_mut().enumerate() {
             let (pixel, channel) = (i / shape.pixel, i % shape.pixel);
@@ -172,7 +172,7 @@ fn a_window_that_shared_memory_cannot_hold_does_not_fit() {
         window: vec![1.0 / taps as f32; taps],
         ..shape([1, 20, 20], 3, 4)
     };
-    // 11 must fit on every device: WebGPU promises 16 KiB.
+    // A window of 11 must fit on every device: WebGPU guarantees 16 KiB.
     assert!(with(11).fits(&client));
     assert!(!with(100_001).fits(&client));
 }

@@ -1,4 +1,4 @@
-//! Projection and its gradients.
+//! Tests of projection and its gradients.
 
 use splat_core::{ImageSize, ProjectSettings};
 use splat_kernels::project::{ProjectInputs, project, project_backward};
@@ -95,7 +95,7 @@ fn projection_and_all_its_gradients_agree_with_float64() {
         assert_close(&format!("packed[{k}]"), &column, &other, 2e-6);
     }
 
-    // A random linear loss of all entries but the extents.
+    // A random linear loss of all columns except the extents.
     let mut weights = uniform(&mut rng(6), packed.len(), -1.0, 1.0);
     for row in weights.chunks_mut(9) {
         row[7] = 0.0;
@@ -245,8 +245,8 @@ fn the_length_of_a_quaternion_does_not_matter() {
 #[test]
 fn needles_keep_their_determinant() {
     let Some(client) = client() else { return };
-    // 10 : 1e-3 : 1e-3 world units at depth 3, every orientation: thousands of pixels long, a
-    // fraction of one wide.
+    // 10 : 1e-3 : 1e-3 world units at depth 3, in every orientation: thousands of pixels long, a
+    // fraction of a pixel wide.
     let gaussians = 500;
     let quats = uniform(&mut rng(9), gaussians * 4, -1.0, 1.0);
     let [_, _, _, viewmats, intrinsics] = scene(1);

@@ -1,4 +1,4 @@
-//! Blending and its gradients.
+//! Tests of blending and its gradients.
 
 use splat_kernels::intersect::Frames;
 use splat_kernels::rasterize::{
@@ -28,7 +28,7 @@ struct Scene {
 }
 
 impl Scene {
-    /// Splats of a few pixels, overlapping; opacities within `opacity`.
+    /// Overlapping splats of a few pixels, with opacities within `opacity`.
     fn new(
         cameras: usize,
         gaussians: usize,
@@ -111,7 +111,8 @@ impl Scene {
     }
 }
 
-/// Forward and all gradients, in every way of summing them, against float64 within `limit`.
+/// Compares the forward pass and all gradients, in every summation mode, with float64 within
+/// `limit`.
 fn check(name: &str, scene: &Scene, limit: f64) {
     let Some(client) = client() else { return };
     let inputs = scene.inputs(&client);
@@ -375,7 +376,7 @@ fn only_the_wanted_gradients_and_the_same_bits_every_time() {
 #[test]
 fn sums_of_thousands_of_tiles_lose_nothing() {
     let Some(client) = client() else { return };
-    // Each of three splats covers all of 4,096 tiles, whose units all add to the same few floats.
+    // Each of three splats covers all 4,096 tiles, whose units all add to the same few floats.
     let side = 1024;
     let mut scene = Scene::new(1, 3, side, side, 2, [0.3, 0.5], 45);
     for (i, row) in scene.packed.chunks_mut(9).enumerate() {
@@ -393,7 +394,7 @@ fn sums_of_thousands_of_tiles_lose_nothing() {
         ]);
     }
     let inputs = scene.inputs(&client);
-    // Of one sign: nothing cancels, and a tile that is missing is 1 of 4,096.
+    // All of one sign, so nothing cancels, and a missing tile shows as 1 of 4,096.
     let weights = uniform(&mut rng(46), (side * side * 3) as usize, 0.5, 1.0);
     let grad = upload(&client, &weights);
     let [ordered, atomic, exchange] = ALL_SUMS.map(|sums| {
@@ -426,7 +427,7 @@ fn sums_of_thousands_of_tiles_lose_nothing() {
 #[test]
 fn more_tiles_than_one_dimension_of_workgroups_can_hold() {
     let Some(client) = client() else { return };
-    // One pixel wide: 65,600 tiles below each other.
+    // One pixel wide: 65,600 tiles in a column.
     let height = 16 * 65_600;
     let mut scene = Scene::new(1, 3, 1, height, 1, [0.5, 0.9], 42);
     scene.background = None;
@@ -453,7 +454,7 @@ fn more_tiles_than_one_dimension_of_workgroups_can_hold() {
         [false, true, false, false].into(),
     )
     .into();
-    // One colour of 1 shines on all pixels: the sum of its weights.
+    // One splat of colour 1 lights all pixels: the sum of its weights.
     let expected: Vec<f64> = (0..3)
         .map(|n| {
             let mut alone = scene.wide();
@@ -507,16 +508,16 @@ fn evaluations_are_counted() {
     }
     println!("{count:?}; {until_stop} without any lists");
     assert_eq!(count.blended, blended);
-    // A pixel sees what it blends, and the splat before which it stops.
+    // A pixel walks the splats that it blends, and the one before which it stops.
     assert!(stopped > 0, "no pixel stops");
     assert_eq!(count.seen, blended + stopped);
     assert!(count.tested > count.blended && count.tested < until_stop / 2);
 }
 
-/// Seconds of processor time that this process has used: other work on the machine does not count.
+/// Processor time of this process in seconds, unaffected by other work on the machine.
 fn processor_seconds() -> f64 {
     let stat = std::fs::read_to_string("/proc/self/stat").unwrap_or_default();
-    // After the name in parentheses: utime and stime are entries 11 and 12, in hundredths of a
+    // After the name in parentheses, utime and stime are entries 11 and 12, in hundredths of a
     // second.
     let fields = stat.rsplit(')').next().unwrap_or_default();
     let ticks = fields.split_whitespace().skip(11).take(2);

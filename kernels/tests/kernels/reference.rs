@@ -1,4 +1,4 @@
-//! The formulas of the kernels in float64, without tiles, as plain as can be.
+//! The formulas of the kernels in float64, without tiles and as simple as possible.
 
 #[derive(Clone, Copy)]
 pub struct View {
@@ -29,7 +29,7 @@ fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-/// One Gaussian to one camera: the packed row, all zero where culled.
+/// Projects one Gaussian to one camera: the packed row, zero if culled.
 pub fn project(
     mean: &[f64],
     quat: &[f64],
@@ -161,7 +161,7 @@ pub fn rasterize(
     image
 }
 
-/// Colour of one direction; 3DGS's table.
+/// Colour in one direction, from 3DGS's table.
 pub fn spherical_harmonics(coefficients: &[f64], dir: &[f64], degree: usize) -> [f64; 3] {
     let length = dir.iter().map(|v| v * v).sum::<f64>().sqrt();
     let [x, y, z] = std::array::from_fn(|i| if length > 0.0 { dir[i] / length } else { 0.0 });

@@ -1,4 +1,4 @@
-//! Prefix sums.
+//! Tests of prefix sums.
 
 use rand::RngExt;
 use splat_kernels::{Buffer, scan};

@@ -1,4 +1,4 @@
-//! Spherical harmonics and their gradients.
+//! Tests of spherical harmonics and their gradients.
 
 use splat_kernels::sh;
 

@@ -1,5 +1,5 @@
-//! Colours of coefficients in half precision: those of the same coefficients in single precision,
-//! bit for bit.
+//! Colours from half-precision coefficients equal those from the same coefficients in single
+//! precision, bit for bit.
 
 use cubecl::client::Client;
 use splat_core::ShColorTensors;
@@ -8,7 +8,7 @@ use splat_kernels::{Buffer, HalfBuffer, reads_half};
 
 use crate::device::{client, rng, uniform, upload};
 
-/// The float that a half stands for.
+/// The float value of a half.
 fn single(half: u16) -> f32 {
     let (exponent, fraction) = (i32::from(half >> 10 & 31), f32::from(half & 1023));
     let magnitude = match exponent {
@@ -64,8 +64,7 @@ fn halves_are_read_as_the_numbers_they_stand_for() {
             }
         })
         .collect();
-    // Zeros, the smallest, the largest below the normal ones, the smallest of these, the largest of
-    // all, infinity.
+    // Zeros, the smallest and largest subnormal, the smallest and largest normal, infinity.
     let odd = [0, 0x8000, 1, 0x8001, 0x03ff, 0x0400, 0x7bff, 0x7c00];
     halves[..odd.len()].copy_from_slice(&odd);
     let values: Vec<f32> = halves.iter().map(|half| single(*half)).collect();

@@ -1,4 +1,4 @@
-//! Radix sort.
+//! Tests of the radix sort.
 
 use rand::RngExt;
 use splat_kernels::Buffer;
