@@ -1,5 +1,5 @@
-//! Constants, layouts and settings that the kernels, the ops and the file readers agree on, and how
-//! much memory there is. No dependencies.
+//! Constants, layouts and settings shared by the kernels, the ops and the file readers, and a
+//! measure of available memory. No dependencies.
 
 pub mod exp;
 pub mod memory;

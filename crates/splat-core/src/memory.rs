@@ -1,23 +1,23 @@
-//! Memory that this process can still get, so that work which needs more is refused in words: an
-//! allocation that fails ends the process.
+//! Memory available to this process. Work that needs more is refused with an error, since a failed
+//! allocation would end the process.
 
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
-/// How long a measurement is good for what needs little of it.
+/// How long a measurement stays valid for small needs.
 const FRESH: Duration = Duration::from_secs(1);
-/// A need of more than this share of the memory left is worth measuring again.
+/// Inverse share of the memory left above which a need triggers a new measurement.
 const LARGE_SHARE: u64 = 4;
-/// A share of the memory left is not counted on: what lies between large allocations may be too
-/// small for the next.
+/// Inverse share of the memory left that is not counted on: gaps between large allocations may be
+/// too small for the next one.
 const SLACK_SHARE: u64 = 8;
-/// Left alone for everything else that allocates meanwhile.
+/// Memory left for other allocations in the meantime.
 const RESERVE: u64 = 128 << 20;
 
-/// Bytes that this process can still allocate: the least of what the system has left, of what the
-/// control groups it is in may still use, and of what its own limits (`ulimit -v`, `ulimit -d`)
-/// leave. None where the system does not say, which is every system but Linux.
+/// Bytes that this process can still allocate: the minimum of what the system has left, of what its
+/// control groups may still use, and of what its own limits (`ulimit -v`, `ulimit -d`) leave.
+/// `None` on systems other than Linux, which do not report it.
 pub fn available_memory() -> Option<u64> {
     let read = |path: &Path| std::fs::read_to_string(path).ok();
     let proc = |file: &str| read(&Path::new("/proc").join(file));
@@ -36,9 +36,8 @@ pub fn available_memory() -> Option<u64> {
     .min()
 }
 
-/// The memory that can be counted on, if `needed` bytes are more than that. What needs little of it
-/// does not measure anew every time, and what needs next to nothing is not asked for: a moment's
-/// shortage should not end a run.
+/// The memory that can be counted on, if `needed` bytes exceed it. Small needs reuse the last
+/// measurement, and tiny ones are always granted: a brief shortage should not end a run.
 pub fn lacking(needed: u64) -> Option<u64> {
     if needed <= RESERVE / 2 {
         return None;
@@ -51,13 +50,13 @@ pub fn lacking(needed: u64) -> Option<u64> {
     let (at, left) = known.unwrap_or_else(|| (Instant::now(), available_memory()));
     let usable = left.map(|left| (left - left / SLACK_SHARE).saturating_sub(RESERVE));
     let lacking = usable.filter(|usable| needed > *usable);
-    // Memory granted now is not there for the next who asks.
+    // Memory granted now is not available to the next caller.
     let granted = if lacking.is_none() { needed } else { 0 };
     *last = Some((at, left.map(|left| left.saturating_sub(granted))));
     lacking
 }
 
-/// A size for messages.
+/// Formats a size for messages.
 pub fn in_units(bytes: u64) -> String {
     match bytes as f64 {
         bytes if bytes >= 1e9 => format!("{:.1} GB", bytes / 1e9),
@@ -65,8 +64,8 @@ pub fn in_units(bytes: u64) -> String {
     }
 }
 
-/// Address space of a process that is in use, from its `status`. `VmSize` and `VmData` have more:
-/// what an allocator has reserved for itself and not touched, which it will hand out.
+/// Address space in use, from a process's `status`. `VmSize` and `VmData` include memory that an
+/// allocator has reserved but not touched, and will hand out later.
 fn mapped(status: &str) -> Option<u64> {
     let parts = ["RssAnon:", "VmStk:", "VmExe:", "VmLib:"];
     parts.iter().map(|part| kilobytes(status, part)).sum()
@@ -83,14 +82,14 @@ fn kilobytes(text: &str, name: &str) -> Option<u64> {
     value.checked_mul(1024)
 }
 
-/// The soft limit in a line of `/proc/self/limits`; none where it is `unlimited`.
+/// The soft limit in a line of `/proc/self/limits`; `None` if `unlimited`.
 fn limit(limits: &str, name: &str) -> Option<u64> {
     let line = limits.lines().find_map(|line| line.strip_prefix(name))?;
     line.split_whitespace().next()?.parse().ok()
 }
 
-/// Memory that the control groups of this process (`/proc/self/cgroup`), and those that they are
-/// in, may still use.
+/// Memory that the control groups of this process (`/proc/self/cgroup`), and their parents, may
+/// still use.
 fn left_in_groups(groups: &str, read: &dyn Fn(&Path) -> Option<String>) -> Option<u64> {
     let left = groups.lines().filter_map(|line| {
         let [_, controllers, path] = line.splitn(3, ':').collect::<Vec<_>>().try_into().ok()?;
@@ -120,8 +119,7 @@ fn left_in_groups(groups: &str, read: &dyn Fn(&Path) -> Option<String>) -> Optio
     left.min()
 }
 
-/// Memory that one group may still use: its limit less its use, of which files that were read are
-/// given back when needed.
+/// Memory that one group may still use: its limit minus its usage, without reclaimable file cache.
 fn left_in_group(
     folder: PathBuf,
     [max, current, files]: [&str; 3],

@@ -1,4 +1,4 @@
-//! Sizes and settings of the ops. Every constant of the method is a field here, with its default.
+//! Sizes and settings of the ops. Every constant of the method is a field with a default.
 
 /// Size of the rendered image in pixels. The centre of pixel (i, j) lies at (i + 0.5, j + 0.5).
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -9,7 +9,7 @@ pub struct ImageSize {
     pub height: u32,
 }
 
-/// Smallest opacity that still changes an 8-bit image (3DGS appendix C).
+/// Smallest opacity that changes an 8-bit image (3DGS appendix C).
 pub const ALPHA_MIN: f64 = 1.0 / 255.0;
 
 /// Settings of `project`.
@@ -22,8 +22,8 @@ pub struct ProjectSettings {
     /// Low-pass filter: variance added to the diagonal of the 2D covariance, in pixels squared.
     /// Default 0.3 (3DGS reference implementation).
     pub eps2d: f64,
-    /// The Jacobian of the projection is evaluated at most this share of the image's width
-    /// (height) outside of it. Default 0.15.
+    /// Margin outside the image, as a share of its width (height), within which the Jacobian of the
+    /// projection is evaluated. Default 0.15.
     pub clamp_margin: f64,
     /// Opacity at which a splat's extent ends. Default 1/255 (3DGS appendix C).
     pub alpha_min: f64,
@@ -47,35 +47,35 @@ impl ProjectSettings {
         Self::default()
     }
 
-    /// The same with another `near`.
+    /// Sets `near`.
     #[must_use]
     pub fn with_near(mut self, near: f64) -> Self {
         self.near = near;
         self
     }
 
-    /// The same with another `far`.
+    /// Sets `far`.
     #[must_use]
     pub fn with_far(mut self, far: f64) -> Self {
         self.far = far;
         self
     }
 
-    /// The same with another `eps2d`.
+    /// Sets `eps2d`.
     #[must_use]
     pub fn with_eps2d(mut self, eps2d: f64) -> Self {
         self.eps2d = eps2d;
         self
     }
 
-    /// The same with another `clamp_margin`.
+    /// Sets `clamp_margin`.
     #[must_use]
     pub fn with_clamp_margin(mut self, clamp_margin: f64) -> Self {
         self.clamp_margin = clamp_margin;
         self
     }
 
-    /// The same with another `alpha_min`.
+    /// Sets `alpha_min`.
     #[must_use]
     pub fn with_alpha_min(mut self, alpha_min: f64) -> Self {
         self.alpha_min = alpha_min;
@@ -86,15 +86,14 @@ impl ProjectSettings {
 /// Settings of `rasterize`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RasterizeSettings {
-    /// A splat is skipped at a pixel where its alpha is below this, which is above 0. Default 1/255
-    /// (3DGS appendix C).
+    /// Alpha below which a splat is skipped at a pixel; positive. Default 1/255 (3DGS appendix C).
     pub alpha_min: f64,
-    /// Alpha is capped here, below 1; the gradient through a capped alpha is zero. Default 0.99
-    /// (3DGS appendix C).
+    /// Cap of alpha, below 1; the gradient through a capped alpha is zero. Default 0.99 (3DGS
+    /// appendix C).
     pub alpha_max: f64,
-    /// A pixel stops before its transmittance would fall below this; never, if it is 0. Default
-    /// 9.999e-5: the 1e-4 of 3DGS appendix C less one part in 10,000, because two splats at the cap
-    /// leave exactly 1e-4, which rounds to either side.
+    /// A pixel stops before its transmittance would fall below this; if 0, never. Default 9.999e-5:
+    /// the 1e-4 of 3DGS appendix C less one part in 10,000, because two splats at the cap leave
+    /// exactly 1e-4, which rounds either way.
     pub transmittance_min: f64,
     /// Makes gradients reproducible bit for bit. Default true.
     ///
@@ -123,28 +122,28 @@ impl RasterizeSettings {
         Self::default()
     }
 
-    /// The same with another `alpha_min`.
+    /// Sets `alpha_min`.
     #[must_use]
     pub fn with_alpha_min(mut self, alpha_min: f64) -> Self {
         self.alpha_min = alpha_min;
         self
     }
 
-    /// The same with another `alpha_max`.
+    /// Sets `alpha_max`.
     #[must_use]
     pub fn with_alpha_max(mut self, alpha_max: f64) -> Self {
         self.alpha_max = alpha_max;
         self
     }
 
-    /// The same with another `transmittance_min`.
+    /// Sets `transmittance_min`.
     #[must_use]
     pub fn with_transmittance_min(mut self, transmittance_min: f64) -> Self {
         self.transmittance_min = transmittance_min;
         self
     }
 
-    /// The same with another `deterministic`.
+    /// Sets `deterministic`.
     #[must_use]
     pub fn with_deterministic(mut self, deterministic: bool) -> Self {
         self.deterministic = deterministic;
@@ -155,16 +154,16 @@ impl RasterizeSettings {
 /// Gradient of the clamp of colours at zero, `max(x, 0)`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum ClampGradient {
-    /// The derivative: nothing passes below zero.
+    /// The derivative: zero below zero.
     #[default]
     Exact,
     /// The derivative, and below zero also a gradient whose descent raises the channel. A channel
-    /// that has slipped below zero in every view would otherwise stay black for good, since nothing
-    /// could ever reach it. For training.
+    /// below zero in every view would otherwise stay black forever, since no gradient reaches it.
+    /// For training.
     Recovering,
 }
 
-/// Settings of `sh_colors`. A degree alone becomes settings by [`From`], with the exact gradient.
+/// Settings of `sh_colors`. A degree converts into settings with the exact gradient.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub struct ShColorSettings {
     /// Degree of the spherical harmonics, 0 to 3. Default 0.
@@ -179,14 +178,14 @@ impl ShColorSettings {
         Self::default()
     }
 
-    /// The same with another `degree`.
+    /// Sets `degree`.
     #[must_use]
     pub fn with_degree(mut self, degree: usize) -> Self {
         self.degree = degree;
         self
     }
 
-    /// The same with another `clamp_gradient`.
+    /// Sets `clamp_gradient`.
     #[must_use]
     pub fn with_clamp_gradient(mut self, clamp_gradient: ClampGradient) -> Self {
         self.clamp_gradient = clamp_gradient;
@@ -203,7 +202,7 @@ impl From<usize> for ShColorSettings {
     }
 }
 
-/// A function of one element.
+/// An elementwise function.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Activation {
     /// `exp(x)`.
@@ -212,7 +211,7 @@ pub enum Activation {
     Sigmoid,
 }
 
-/// The numbers of one step of Adam; the bias corrections are already in `rate` and `epsilon`.
+/// Constants of one step of Adam, with the bias corrections folded into `rate` and `epsilon`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct AdamStep {
     /// Decay of the first moment.
@@ -227,16 +226,17 @@ pub struct AdamStep {
     pub rows: AdamRows,
 }
 
-/// Which rows of a parameter, along its first dimension, a step changes.
+/// Rows of a parameter, along its first dimension, that a step changes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum AdamRows {
-    /// All, as Adam is defined: where the gradient is zero, moments decay and parameters drift on.
+    /// All rows, as Adam is defined: where the gradient is zero, moments decay and parameters keep
+    /// drifting.
     #[default]
     All,
-    /// Those whose gradient is not all zero, NaN counting as zero; the others keep parameter and
-    /// moments, as if the step had not been for them (the sparse Adam of Mallick et al. 2024,
-    /// *Taming 3DGS*; `SelectiveAdam` of gsplat). Another optimiser with other results, and faster
-    /// where most Gaussians are out of view.
+    /// Rows whose gradient is not all zero (NaN counts as zero); others keep parameter and moments,
+    /// as if the step had not happened. This is the sparse Adam of Mallick et al. 2024, *Taming
+    /// 3DGS*, and `SelectiveAdam` of gsplat: another optimiser with other results, and faster if
+    /// most Gaussians are out of view.
     Seen,
 }
 

@@ -1,7 +1,6 @@
 //! Real spherical harmonics in the basis of 3DGS.
 //!
-//! Each constant is written as the shortest decimal that names its float of double precision;
-//! single precision rounds it.
+//! Each constant is the shortest decimal that identifies its f64; single precision rounds it.
 
 /// Highest degree of spherical harmonics.
 pub const SH_DEGREE_MAX: usize = 3;
@@ -12,15 +11,15 @@ pub const SH_C0: f64 = 0.282_094_791_773_878_14;
 /// Factor of the three functions of degree 1.
 pub const SH_C1: f64 = 0.488_602_511_902_919_9;
 
-/// Factors of the functions of degree 2: of xy, yz and xz; of 2 zz - xx - yy; of xx - yy.
+/// Factors of the functions of degree 2: xy, yz and xz; 2 zz - xx - yy; xx - yy.
 pub const SH_C2: [f64; 3] = [
     1.092_548_430_592_079_2,
     0.315_391_565_252_520_05,
     0.546_274_215_296_039_6,
 ];
 
-/// Factors of the functions of degree 3: of y (3 xx - yy) and x (xx - 3 yy); of xyz; of y and x (4
-/// zz - xx - yy); of z (2 zz - 3 xx - 3 yy); of z (xx - yy).
+/// Factors of the functions of degree 3: y (3 xx - yy) and x (xx - 3 yy); xyz; y and x (4 zz - xx -
+/// yy); z (2 zz - 3 xx - 3 yy); z (xx - yy).
 pub const SH_C3: [f64; 5] = [
     0.590_043_589_926_643_5,
     2.890_611_442_640_554,

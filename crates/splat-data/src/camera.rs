@@ -27,14 +27,14 @@ pub struct Camera {
 }
 
 impl Camera {
-    /// Where the camera stands, in the world.
+    /// Position of the camera in the world.
     pub fn position(&self) -> DVec3 {
         let [r0, r1, r2] = [0, 1, 2].map(|i| self.viewmat.row(i));
         -(r0.truncate() * r0.w + r1.truncate() * r1.w + r2.truncate() * r2.w)
     }
 
-    /// The same camera in a world that counts from `origin`. To be done before the camera becomes a
-    /// tensor: in double precision the difference of two large coordinates is exact.
+    /// The same camera in a world with its origin at `origin`. Call it before converting to
+    /// tensors: in double precision the difference of two large coordinates is exact.
     pub fn relative_to(&self, origin: [f64; 3]) -> Self {
         Self {
             viewmat: self.viewmat * DMat4::from_translation(DVec3::from(origin)),

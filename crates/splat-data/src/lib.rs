@@ -1,6 +1,6 @@
 //! Captures and scene files as plain data, without tensors.
 //!
-//! [`Capture`] is a set of photos with their cameras and the points of structure from motion;
+//! [`Capture`] is a set of photos with their cameras and the points from structure from motion;
 //! [`scene`] reads and writes trained splats ([`SplatData`]); [`SceneScale`] is the size of a
 //! scene, from which every length follows.
 

@@ -1,37 +1,37 @@
-//! Files that are written whole or not at all, and whether a place can be written to, asked before
-//! long work.
+//! Atomic file replacement, and checks that a path is writable before long work.
 
 use std::io::{Error, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
-/// Why a file or a folder cannot be written.
+/// Why a file or folder cannot be written.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {source}", path.display())]
 pub struct WriteError {
     /// The file or folder.
     pub path: PathBuf,
-    /// What the system said.
+    /// The system's error.
     pub source: Error,
 }
 
-/// Replaces the file `path` by `contents`; folders on the way are made. After a crash of the
-/// machine it may be empty: for what can be made again. A device or a pipe is written to.
+/// Replaces the file `path` by `contents`, creating parent folders. After a machine crash the file
+/// may be empty, so use it for data that can be recomputed. Devices and pipes are written to
+/// directly.
 ///
 /// # Errors
 ///
-/// Whatever the system says; the old file, if there was one, is then untouched.
+/// The system's error; an existing file is then untouched.
 pub fn write_atomically(path: &Path, contents: &[u8]) -> std::io::Result<()> {
     replace(path, contents, false)
 }
 
-/// [`write_atomically`] for what cannot be made again. The disk has the new file before it loses
-/// the old one, so that also a crash of the machine leaves one of them. The price is to wait for
-/// the disk: measured on that of a virtual machine, 1 to 5 ms for a small file, 0.16 s for 100 MB,
-/// 1.6 s for 500 MB (the checkpoint of 700,000 Gaussians).
+/// [`write_atomically`] for data that cannot be recomputed. The new file reaches the disk before
+/// the old one is removed, so that one of them survives a machine crash. The price is waiting for
+/// the disk: on a virtual machine, 1 to 5 ms for a small file, 0.16 s for 100 MB, 1.6 s for 500 MB
+/// (the checkpoint of 700,000 Gaussians).
 ///
 /// # Errors
 ///
-/// As those of [`write_atomically`].
+/// Those of [`write_atomically`].
 pub fn write_durably(path: &Path, contents: &[u8]) -> std::io::Result<()> {
     replace(path, contents, true)
 }
@@ -43,7 +43,7 @@ fn replace(path: &Path, contents: &[u8], durably: bool) -> std::io::Result<()> {
             .open(path)?
             .write_all(contents);
     }
-    // The file that a link points to, not the link.
+    // The target of a link, not the link itself.
     let linked = path
         .is_symlink()
         .then(|| path.canonicalize().ok())
@@ -51,7 +51,7 @@ fn replace(path: &Path, contents: &[u8], durably: bool) -> std::io::Result<()> {
     let path = linked.as_deref().unwrap_or(path);
     let folder = folder_of(path);
     std::fs::create_dir_all(folder)?;
-    // On the same file system as its place, so that the rename is one step.
+    // On the same file system as the target, so that the rename is one step.
     let file = temporary_file(folder)?;
     file.as_file().write_all(contents)?;
     if durably {
@@ -64,8 +64,8 @@ fn replace(path: &Path, contents: &[u8], durably: bool) -> std::io::Result<()> {
     Ok(())
 }
 
-/// Tries whether files can be written to `folder`, which is made if need be: with a file that is
-/// removed again.
+/// Checks that files can be written to `folder`, creating it if necessary, by writing and removing
+/// a file.
 ///
 /// # Errors
 ///
@@ -80,7 +80,7 @@ pub fn probe_folder(folder: &Path) -> Result<(), WriteError> {
     tried().map_err(|source| WriteError {
         path: folder.to_path_buf(),
         source: match source.kind() {
-            // What the system says of a file in a folder's place.
+            // The system's error for a file in the folder's place.
             ErrorKind::AlreadyExists | ErrorKind::NotADirectory => Error::new(
                 source.kind(),
                 "a file is in the place of a folder to write to",
@@ -90,11 +90,11 @@ pub fn probe_folder(folder: &Path) -> Result<(), WriteError> {
     })
 }
 
-/// Tries whether the file `path` can be written, without touching it.
+/// Checks that the file `path` can be written, without touching it.
 ///
 /// # Errors
 ///
-/// [`WriteError`], naming the file, or its folder.
+/// [`WriteError`], naming the file or its folder.
 pub fn probe_file(path: &Path) -> Result<(), WriteError> {
     if is_device(path) {
         return Ok(());
@@ -111,11 +111,11 @@ pub fn probe_file(path: &Path) -> Result<(), WriteError> {
     probe_folder(folder_of(path))
 }
 
-/// [`probe_file`] of every path that is there.
+/// [`probe_file`] for every path that exists.
 ///
 /// # Errors
 ///
-/// Of the first that cannot be written.
+/// Those of [`probe_file`], for the first path that cannot be written.
 pub fn probe_files<'a>(
     paths: impl IntoIterator<Item = &'a Option<PathBuf>>,
 ) -> Result<(), WriteError> {
@@ -125,12 +125,12 @@ pub fn probe_files<'a>(
         .try_for_each(|path| probe_file(path))
 }
 
-/// Whether this is a pipe, a terminal, or another thing that is written to and never replaced, such
-/// as `/dev/stdout`.
+/// True for pipes, terminals and other targets that are written to and never replaced, such as
+/// `/dev/stdout`.
 fn is_device(path: &Path) -> bool {
     let special = |kind: std::fs::Metadata| !kind.is_file() && !kind.is_dir();
-    // What is there may lead to a file, which then is not to be replaced either. `/dev/shm` is a
-    // folder like others.
+    // The path may lead to a file, which must not be replaced either. `/dev/shm` is an ordinary
+    // folder.
     let devices = ["/dev", "/dev/fd"].map(|folder| Some(Path::new(folder)));
     let device = cfg!(unix) && devices.contains(&path.parent()) && path.exists() && !path.is_dir();
     device || std::fs::metadata(path).is_ok_and(special)
@@ -144,12 +144,12 @@ fn folder_of(path: &Path) -> &Path {
     }
 }
 
-/// A file with a random name, which is removed unless it is renamed.
+/// A file with a random name, removed unless renamed.
 fn temporary_file(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {
     let mut builder = tempfile::Builder::new();
     readable_by_all(&mut builder);
     builder.tempfile_in(folder).map_err(|error| {
-        // The random name says nothing to anybody.
+        // The random name means nothing to the user.
         let text = error.to_string();
         match text.split_once(" at path \"") {
             Some((reason, _)) => Error::new(error.kind(), reason.to_owned()),
@@ -158,7 +158,7 @@ fn temporary_file(folder: &Path) -> std::io::Result<tempfile::NamedTempFile> {
     })
 }
 
-/// Makes a rename last. Not every system can, and the file is whole without it.
+/// Makes a rename durable. Not every system supports it, and the file is complete without it.
 fn sync_folder(folder: &Path) {
     if cfg!(unix) {
         let _ = std::fs::File::open(folder).and_then(|folder| folder.sync_all());
@@ -169,7 +169,7 @@ fn sync_folder(folder: &Path) {
 #[cfg(unix)]
 fn readable_by_all(builder: &mut tempfile::Builder<'_, '_>) {
     use std::os::unix::fs::PermissionsExt;
-    // The process's umask still applies.
+    // The umask of the process still applies.
     builder.permissions(std::fs::Permissions::from_mode(0o666));
 }
 
@@ -190,11 +190,11 @@ mod tests {
         write_durably(&path, b"newer").unwrap();
         assert_eq!(std::fs::read(&path).unwrap(), b"newer");
 
-        // A folder in the file's place cannot be replaced.
+        // A folder in the place of the file cannot be replaced.
         let blocked = folder.path().join("new");
         assert!(write_atomically(&blocked, b"half").is_err());
         assert!(write_durably(&blocked, b"half").is_err());
-        // Neither beside the good file nor beside the blocked one is anything else.
+        // Nothing else is left beside the good file or the blocked one.
         assert_eq!(std::fs::read_dir(&blocked).unwrap().count(), 1);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
     }

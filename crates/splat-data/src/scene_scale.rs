@@ -1,27 +1,24 @@
-//! The size of a scene: the one length that every other length of training, rendering and checks
-//! follows.
+//! The size of a scene: the unit of all other lengths in training, rendering and checks.
 //!
-//! A capture has no unit: structure from motion leaves the scale open, and the same photos come in
-//! metres, millimetres or anything else. So no length may be a constant. Those that there are, and
+//! A capture has no unit: structure from motion leaves the scale open, and the same photos may come
+//! in metres, millimetres or anything else. Therefore no length may be a constant. The lengths, and
 //! what they follow:
 //!
 //! | length | value |
 //! |---|---|
 //! | near and far plane | [`SceneScale::near`], [`SceneScale::far`] |
-//! | step of the means | learning rate x [`SceneScale::length`] (`LearningRates::at`) |
+//! | step of the means | learning rate x [`SceneScale::length`] (`Field::rate_at`) |
 //! | epsilon of the means' Adam, one over a length | [`SceneScale::means_epsilon`] |
-//! | sizes at which Gaussians split and are pruned | shares of [`SceneScale::length`] (`AdaptiveSettings`) |
+//! | sizes at which Gaussians split and are pruned | shares of [`SceneScale::length`] (`AdcSettings`) |
 //! | first scales | distances of the points; where all coincide, [`SceneScale::length`] (`splats_from_points`) |
-//! | distance from which coordinates count from an origin | [`SceneScale::origin`] |
+//! | distance beyond which coordinates are relative to an origin | [`SceneScale::origin`] |
 //! | thresholds of warnings | distances between the capture's own cameras and points |
 //! | orbit of `splat render` | the spread of the scene's own Gaussians, or else [`SceneScale::length`] |
 //!
-//! Absolute lengths that are left, and why:
-//! [`ProjectSettings::near`](splat_core::ProjectSettings::near) and `far` of the bare op, whose
-//! caller knows the unit (0.01 and 1e10, as in gsplat); lengths in pixels (the low-pass filter, the
-//! largest size of a splat), which are the photo's; the sizes that single precision has room for,
-//! from 1e-15 to 1e10; and 1, the size of a scene that has none (one camera in the place of its
-//! points).
+//! The remaining absolute lengths: [`ProjectSettings::near`](splat_core::ProjectSettings::near) and
+//! `far` of the bare op, whose caller knows the unit (0.01 and 1e10, as in gsplat); lengths in
+//! pixels (the low-pass filter, the largest size of a splat); the sizes that fit single precision,
+//! 1e-15 to 1e10; and 1, the size of a degenerate scene (one camera at the position of its points).
 
 use glam::DVec3;
 use splat_core::ProjectSettings;
@@ -34,39 +31,40 @@ use crate::SplatData;
 pub struct SceneScale(f64);
 
 impl SceneScale {
-    /// Share of the scene's size at which the near plane lies. gsplat's 0.01, in whose normalised
-    /// world cameras are about one unit from what they look at.
+    /// Near plane, as a share of the scene's size. gsplat's 0.01, in whose normalised world cameras
+    /// are about one unit from their subject.
     const NEAR: f64 = 0.01;
-    /// Sizes of the scene at which the far plane lies (gsplat).
+    /// Far plane, in sizes of the scene (gsplat).
     const FAR: f64 = 1e10;
     /// Adam's epsilon of 3DGS, in a scene of size 1.
     const EPSILON: f64 = 1e-15;
-    /// From so many sizes of the scene on, single precision resolves less than 1e-5 of it.
+    /// Distance from the world's zero, in sizes of the scene, beyond which single precision
+    /// resolves less than 1e-5 of the size.
     const ORIGIN_FROM: f64 = 100.0;
-    /// So many points tell the distance of a camera.
+    /// Most points used for the distance of a camera.
     const POINTS: usize = 4096;
 
-    /// Sizes that single precision can train: beyond, squares of gradients and of sizes leave its
-    /// range. Tried from 1e-15 to 1e9.
+    /// Sizes that can be trained in single precision; beyond these, squares of gradients and sizes
+    /// leave its range. Tested from 1e-15 to 1e9.
     const TRAINABLE: core::ops::RangeInclusive<f64> = 1e-15..=1e10;
 
-    /// Whether a scene of this size can be trained and rendered in single precision.
+    /// True if a scene of this size can be trained and rendered in single precision.
     pub fn is_in_range(self) -> bool {
         Self::TRAINABLE.contains(&self.0)
     }
 
-    /// A scene of this size; none where it is not positive and finite.
+    /// A scene of this size; `None` unless positive and finite.
     pub fn new(length: f64) -> Option<Self> {
         (length > 0.0 && length.is_finite()).then_some(Self(length))
     }
 
-    /// The size of a capture: the median over its cameras of each camera's median distance to the
-    /// points, about the distance at which the scene is looked at.
+    /// Size of a capture: the median over cameras of each camera's median distance to the points,
+    /// roughly the viewing distance.
     ///
-    /// 3DGS takes 1.1 times the largest distance of a camera from the mean camera, which for
-    /// cameras all around a scene is nearly the same (0.8 to 1.2 times this on seven captures). But
-    /// one camera that is off makes a maximum anything; medians move by a few percent at most when
-    /// a tenth of the cameras, or of the points, is anywhere at all.
+    /// 3DGS uses 1.1 times the largest distance of a camera from the mean camera, which is nearly
+    /// the same for cameras all around a scene (0.8 to 1.2 times this on seven captures). But one
+    /// wrong camera can make that maximum arbitrary, whereas medians move by a few percent at most
+    /// if a tenth of the cameras or points are arbitrary.
     ///
     /// ```
     /// use splat_data::{Camera, ImageSize, SceneScale};
@@ -95,8 +93,8 @@ impl SceneScale {
             .unwrap_or(Self(1.0))
     }
 
-    /// The size of a scene that nothing is known of but its Gaussians: the median distance of the
-    /// means from their median, or where all are in one place the median of their own sizes.
+    /// Size of a scene of which only the Gaussians are known: the median distance of the means from
+    /// their median, or the median of their own sizes if all are in one place.
     pub fn of_splats(splats: &SplatData) -> Self {
         let every = splats.len().div_ceil(Self::POINTS).max(1);
         let means = splats.means.iter().step_by(every);
@@ -113,22 +111,22 @@ impl SceneScale {
         Self::new(median(positions.iter().map(|at| at.distance(middle))))
     }
 
-    /// World units.
+    /// The size in world units.
     pub fn length(self) -> f64 {
         self.0
     }
 
-    /// Distance of the near plane, world units.
+    /// Distance of the near plane in world units.
     pub fn near(self) -> f64 {
         Self::NEAR * self.0
     }
 
-    /// Distance of the far plane, world units.
+    /// Distance of the far plane in world units.
     pub fn far(self) -> f64 {
         Self::FAR * self.0
     }
 
-    /// The default settings of the projection, with the near and far plane of this scene.
+    /// Default settings of the projection, with the near and far plane of this scene.
     pub fn project_settings(self) -> ProjectSettings {
         ProjectSettings {
             near: self.near(),
@@ -137,16 +135,15 @@ impl SceneScale {
         }
     }
 
-    /// Adam's epsilon for the means. It is added to the size of a gradient, which is one over a
-    /// length: with a constant, a scene in a small unit would be trained by other steps than the
-    /// same scene in a large one.
+    /// Adam's epsilon for the means. It is added to the magnitude of a gradient, which is one over
+    /// a length: with a constant, the same scene would train differently in another unit.
     pub fn means_epsilon(self) -> f64 {
         Self::EPSILON / self.0
     }
 
-    /// Where the means of the scene should count from: the world's zero, unless it is so far away
-    /// that 32-bit floats would round visible detail away; then the median of the cameras, to a
-    /// power of two below the scene's size (short numbers where the scene is large).
+    /// Origin for the means of the scene: the world's zero, unless that is so far away that 32-bit
+    /// floats would lose visible detail. Then it is the median of the cameras, rounded to a power
+    /// of two below the scene's size.
     pub fn origin(self, cameras: &[Camera]) -> [f64; 3] {
         let positions: Vec<DVec3> = cameras.iter().map(Camera::position).collect();
         let middle = middle(&positions);
@@ -159,7 +156,7 @@ impl SceneScale {
     }
 }
 
-/// Median of each axis; zero of nothing.
+/// Median of each axis; zero for no positions.
 fn middle(positions: &[DVec3]) -> DVec3 {
     let axis = |axis: usize| match positions {
         [] => 0.0,
@@ -168,7 +165,7 @@ fn middle(positions: &[DVec3]) -> DVec3 {
     DVec3::new(axis(0), axis(1), axis(2))
 }
 
-/// The middle value, or the mean of the two in the middle; NaN of nothing.
+/// The middle value, or the mean of the two middle values; NaN for no values.
 fn median(values: impl IntoIterator<Item = f64>) -> f64 {
     let mut values: Vec<f64> = values.into_iter().collect();
     let half = values.len() / 2;
@@ -229,7 +226,7 @@ mod tests {
         ]
     }
 
-    /// The promise: a tenth of the cameras may be anywhere at all.
+    /// Promise: a tenth of the cameras may be arbitrary.
     #[test]
     fn a_tenth_of_the_cameras_hardly_moves_the_scale() {
         let mut rng = Pcg64Mcg::seed_from_u64(5);
@@ -295,10 +292,10 @@ mod tests {
         let far = [[4e6, 3.25], [4e6 + 2.0, 3.5]];
         assert_eq!(origin(&near, 1.0), [0.0; 3]);
         assert_eq!(origin(&far, 1.0), [4_000_001.0, 3.0, 0.0]);
-        // One camera that is off does not move the scene.
+        // One wrong camera does not move the scene.
         let one_off = [[0.0, 0.0], [1.0, 0.0], [2.0, 0.0], [1e9, 0.0]];
         assert_eq!(origin(&one_off, 1.0), [0.0; 3]);
-        // The same in any unit, within the rounding to a power of two.
+        // The same in any unit, up to the rounding to a power of two.
         for unit in [1e-6, 1e6] {
             let [x, _, _] = origin(&far, unit);
             assert!((x / unit - 4_000_001.0).abs() <= 2.0, "{x}");

@@ -1,49 +1,48 @@
-//! Text files that others wrote: their byte-order marks, encodings and line ends.
+//! Text files from other programs: byte-order marks, encodings and line ends.
 
 use std::fmt::{self, Display};
 
-/// Bytes of a text file without the byte-order mark that some editors put first.
+/// Bytes of a text file without a leading byte-order mark.
 ///
 /// # Errors
 ///
-/// What is wrong, in words, where the bytes are no UTF-8 or ASCII text from the start: UTF-16 most
-/// of all.
+/// The reason, if the bytes do not begin as UTF-8 or ASCII text, most often UTF-16.
 pub fn without_mark(bytes: &[u8]) -> Result<&[u8], &'static str> {
     if let Some(text) = bytes.strip_prefix(&[0xef, 0xbb, 0xbf]) {
         return Ok(text);
     }
     let utf16_mark = bytes.starts_with(&[0xff, 0xfe]) || bytes.starts_with(&[0xfe, 0xff]);
-    // Text of numbers and English words has a zero in every second byte of UTF-16.
+    // In UTF-16, numbers and English words have a zero in every second byte.
     if utf16_mark || bytes.iter().take(4).any(|&byte| byte == 0) {
         return Err("UTF-16 text, or no text at all; save it as UTF-8");
     }
     Ok(bytes)
 }
 
-/// The text of a file without its byte-order mark.
+/// Text of a file without its byte-order mark.
 ///
 /// # Errors
 ///
-/// Where in the file there is no text in UTF-8, and what to do.
+/// Position of the first bytes that are not UTF-8, and what to do.
 pub fn utf8(bytes: &[u8]) -> Result<&str, String> {
     std::str::from_utf8(without_mark(bytes)?)
         .map_err(|error| format!("no text in UTF-8 ({error}); save it as such"))
 }
 
-/// A message in one line: those of libraries span several.
+/// Joins the lines of a message into one; messages of libraries span several.
 pub fn one_line(message: &str) -> String {
     message.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// Lines with their index from 0. They end as on Unix or Windows, or as on an old Mac where no
-/// other end is found.
+/// Lines with their index from 0. They end as on Unix or Windows, or as on an old Mac if there is
+/// no other line end.
 pub fn lines(bytes: &[u8]) -> impl Iterator<Item = (usize, &[u8])> {
     let end = if bytes.contains(&b'\n') { b'\n' } else { b'\r' };
     let lines = bytes.split(move |&byte| byte == end);
     lines.map(<[u8]>::trim_ascii).enumerate()
 }
 
-/// Shows a piece of somebody's file in a message: in one line and not too long.
+/// Shows part of a user's file in a message, in one line and shortened.
 pub struct Excerpt<'a>(pub &'a str);
 
 impl Display for Excerpt<'_> {

@@ -1,13 +1,13 @@
-//! What the tests of all crates share.
+//! Helpers shared by the tests of all crates.
 
 use std::fmt::Display;
 
-/// The adapter that a test of the CubeCL kernels opened, a software one included. Where there is
-/// none the test is skipped, loudly; with the environment variable `SPLAT_REQUIRE_WGPU` set, as in
-/// CI, that is a failure.
+/// The adapter opened by a test of the CubeCL kernels, a software one included. Without an adapter
+/// the test is skipped with a message, or fails if the environment variable `SPLAT_REQUIRE_WGPU` is
+/// set, as in CI.
 ///
 /// # Panics
-/// Without an adapter where one is required.
+/// If an adapter is required and there is none.
 pub fn adapter_or_skip<T>(opened: Result<T, impl Display>) -> Option<T> {
     match opened {
         Ok(adapter) => Some(adapter),

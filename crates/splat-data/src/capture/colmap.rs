@@ -1,8 +1,7 @@
-//! COLMAP's sparse model, whatever its encoding: where it lies, what it holds, and whether that
-//! makes sense.
+//! COLMAP's sparse model in either encoding: location, contents, and consistency checks.
 //!
 //! Format: <https://colmap.github.io/format.html>. Files that are not needed here (`rigs.bin`,
-//! `frames.bin`, `project.ini`) are left alone.
+//! `frames.bin`, `project.ini`) are ignored.
 
 use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
@@ -12,16 +11,16 @@ use super::sparse_model::{SparseCamera, SparseImage, SparseModel};
 use super::{CaptureError, CaptureWarning, Point, colmap_binary, colmap_text};
 use crate::text::Excerpt;
 
-/// A folder with a COLMAP model in `sparse/0`, `sparse` or itself.
+/// A folder with a COLMAP model in `sparse/0`, `sparse` or the folder itself.
 pub(super) const FORMAT: CaptureFormat = CaptureFormat {
     is_in: |root| find_folder(root).is_ok(),
     read,
 };
 
-/// Bytes of the longest path that systems take.
+/// Length in bytes of the longest path that systems accept.
 const MOST_NAME: usize = 4096;
 
-/// Finds the model of the capture in `root`, reads and checks it.
+/// Finds, reads and checks the model of the capture in `root`.
 pub(super) fn read(root: &Path) -> Result<(SparseModel, Vec<CaptureWarning>), CaptureError> {
     let (folder, mut warnings) = find_folder(root)?;
     let files = ModelFiles::find(&folder)?;
@@ -35,7 +34,7 @@ pub(super) fn read(root: &Path) -> Result<(SparseModel, Vec<CaptureWarning>), Ca
     Ok((model, warnings))
 }
 
-/// Reads and checks a model from the content of its cameras, images and points.
+/// Reads and checks a model from the contents of its cameras, images and points.
 fn parse(
     files: &ModelFiles,
     [cameras, images, points]: [&[u8]; 3],
@@ -69,7 +68,7 @@ fn parse(
     assemble(files, cameras, images, points)
 }
 
-/// [`read`] of a model that lies in memory: the content of its cameras, images and points.
+/// [`read`] for a model in memory: the contents of its cameras, images and points.
 pub(super) fn parse_model(
     binary: bool,
     files: [&[u8]; 3],
@@ -124,7 +123,7 @@ fn find_folder(root: &Path) -> Result<(PathBuf, Vec<CaptureWarning>), CaptureErr
     Ok((found, warnings))
 }
 
-/// The three files of a model, all of one encoding.
+/// The three files of a model, all in one encoding.
 struct ModelFiles {
     binary: bool,
     cameras: PathBuf,
@@ -133,7 +132,7 @@ struct ModelFiles {
 }
 
 impl ModelFiles {
-    /// The binary files if all are there, else the text files; otherwise names the missing one of
+    /// The binary files if all are present, else the text files; otherwise names the missing one of
     /// the encoding that has the cameras.
     fn find(folder: &Path) -> Result<Self, CaptureError> {
         let [binary, text] = [true, false].map(|binary| Self::of(folder, binary));
@@ -169,7 +168,7 @@ impl ModelFiles {
     }
 }
 
-/// Checks the three lists one by one and against each other.
+/// Checks the three lists individually and against each other.
 fn assemble(
     files: &ModelFiles,
     cameras: Vec<SparseCamera>,
@@ -278,8 +277,7 @@ fn check_image(
     Ok(())
 }
 
-/// Whether a name, in the notation of any system, is that of something in the folder that it is
-/// looked for in.
+/// True if a name, in the notation of any system, stays inside the folder that it is resolved in.
 fn stays_inside(name: &str) -> bool {
     let has_drive = matches!(name.as_bytes(), [drive, b':', ..] if drive.is_ascii_alphabetic());
     let from_root = has_drive || name.starts_with(['/', '\\']);

@@ -1,7 +1,7 @@
 //! COLMAP's binary files: little endian, packed, every list preceded by its length.
 //!
-//! Every length is checked against what is left of the file before anything is allocated for it, so
-//! a truncated or damaged file is an error and never a panic or a huge allocation.
+//! Every length is checked against the rest of the file before anything is allocated for it. A
+//! truncated or damaged file is an error, never a panic or a huge allocation.
 
 use std::fmt::Display;
 use std::path::Path;
@@ -10,7 +10,7 @@ use super::colmap_models::{model_name, pinhole_intrinsics, pinhole_parameters};
 use super::sparse_model::{SparseCamera, SparseImage};
 use super::{CaptureError, Point};
 
-/// Bytes of a camera record up to its parameters, of the shortest image record and of the shortest
+/// Bytes of a camera record up to its parameters, of the shortest image record, and of the shortest
 /// point record.
 const MIN_CAMERA: usize = 4 + 4 + 8 + 8;
 const MIN_IMAGE: usize = 4 + 7 * 8 + 4 + 1 + 8;
@@ -80,7 +80,7 @@ pub(super) fn parse_points(path: &Path, bytes: &[u8]) -> Result<Vec<Point>, Capt
     })
 }
 
-/// What is being read, for messages; formatted only when something is wrong.
+/// The record being read, for messages; formatted only on error.
 #[derive(Clone, Copy)]
 struct Record {
     kind: &'static str,
@@ -116,7 +116,7 @@ impl<'a> Reader<'a> {
         Self { path, rest: bytes }
     }
 
-    /// Reads a count and then that many records, with which the file must end.
+    /// Reads a count and that many records, after which the file must end.
     fn records<T>(
         &mut self,
         kind: &'static str,
@@ -175,7 +175,7 @@ impl<'a> Reader<'a> {
         Ok(values)
     }
 
-    /// A width or height: stored in 64 bits, at most 32 make sense.
+    /// A width or height: stored in 64 bits, of which 32 make sense.
     fn size(&mut self, record: Record, field: &'static str) -> Result<u32, CaptureError> {
         let value = self.take(record, field).map(u64::from_le_bytes)?;
         u32::try_from(value).map_err(|_| CaptureError::BadRecord {
@@ -185,7 +185,7 @@ impl<'a> Reader<'a> {
         })
     }
 
-    /// A length that the rest of the file can hold, at `min_size` bytes an entry.
+    /// A length that fits into the rest of the file, at `min_size` bytes per entry.
     fn list_len(
         &mut self,
         record: Record,
@@ -217,7 +217,7 @@ impl<'a> Reader<'a> {
         Ok(())
     }
 
-    /// A name that ends with a zero byte.
+    /// A name terminated by a zero byte.
     fn name(&mut self, record: Record) -> Result<String, CaptureError> {
         let Some(end) = self.rest.iter().position(|&byte| byte == 0) else {
             return Err(self.truncated(record, "name"));

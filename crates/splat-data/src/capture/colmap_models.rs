@@ -1,7 +1,7 @@
-//! COLMAP's camera models: numbers, names, parameters. What is added here is read.
+//! COLMAP's camera models: numbers, names, parameters. A model added here can be read.
 
-/// Camera models in the order of COLMAP's numbers, with how many parameters each has. New numbers
-/// are only ever appended, so what is missing here is refused by its number.
+/// Camera models in the order of COLMAP's numbers, with their parameter counts. COLMAP only appends
+/// numbers, so unknown ones are refused by number.
 const MODELS: [(&str, usize); 12] = [
     ("SIMPLE_PINHOLE", 3),
     ("PINHOLE", 4),
@@ -17,13 +17,13 @@ const MODELS: [(&str, usize); 12] = [
     ("RAD_TAN_THIN_PRISM_FISHEYE", 16),
 ];
 
-/// Name of the camera model with COLMAP's number.
+/// Name of the camera model with this COLMAP number.
 pub(super) fn model_name(number: i32) -> String {
     let known = usize::try_from(number).ok().and_then(|n| MODELS.get(n));
     known.map_or_else(|| format!("number {number}"), |(name, _)| name.to_string())
 }
 
-/// Number of parameters of a camera model that can be read.
+/// Number of parameters of a supported camera model.
 pub(super) fn pinhole_parameters(model: &str) -> Option<usize> {
     MODELS[..2]
         .iter()

@@ -1,8 +1,8 @@
-//! COLMAP's text files: one record a line (two for an image), fields separated by blanks, `#`
-//! starts a comment line.
+//! COLMAP's text files: one record per line (two for an image), fields separated by blanks,
+//! comments after `#`.
 //!
-//! Comments may be in any encoding; a record must be UTF-8, since a name in another is no file's
-//! name. What is read takes less than 32 times the memory of the file.
+//! Comments may be in any encoding; records must be UTF-8, since a name in another encoding matches
+//! no file. Reading takes less than 32 times the memory of the file.
 
 use std::path::Path;
 use std::str::{FromStr, SplitAsciiWhitespace};
@@ -12,7 +12,7 @@ use super::sparse_model::{SparseCamera, SparseImage};
 use super::{CaptureError, CaptureWarning, Point};
 use crate::text::{Excerpt, lines, without_mark};
 
-/// What a file lists, and how many of it the comments at its head announce.
+/// The records of a file, and the count announced by the comments at its head.
 #[derive(Debug)]
 pub(super) struct Listed<T> {
     pub records: Vec<T>,
@@ -20,8 +20,8 @@ pub(super) struct Listed<T> {
 }
 
 impl<T> Listed<T> {
-    /// The records; a warning if they are not as many as announced. `what` they are is said in the
-    /// plural.
+    /// The records, with a warning if their number differs from the announced one. `what` names
+    /// them in the plural.
     pub fn checked(
         self,
         path: &Path,
@@ -41,7 +41,7 @@ impl<T> Listed<T> {
     }
 }
 
-/// Parses `cameras.txt`: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`. `path` is for messages.
+/// Parses `cameras.txt`: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`. `path` is used in messages.
 pub(super) fn parse_cameras(
     path: &Path,
     text: &[u8],
@@ -83,16 +83,16 @@ pub(super) fn parse_cameras(
     })
 }
 
-/// Parses `images.txt`: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, and then a line of
-/// keypoints, `X Y POINT3D_ID` any number of times, which is skipped. The name runs to the end of
-/// its line, blanks included. `path` is for messages.
+/// Parses `images.txt`: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, followed by a line of
+/// keypoints, `X Y POINT3D_ID` any number of times, which is skipped. The name extends to the end
+/// of its line, blanks included. `path` is used in messages.
 ///
-/// The line of keypoints may be empty, and programs leave it out where there are none. So each line
-/// is taken for what it can be: keypoints are numbers only, three by three, which an image with a
-/// name is not. A line that could be either (a name of nothing but numbers, or keypoints that count
-/// like ids) is keypoints if it follows an image.
+/// The line of keypoints may be empty, and some programs omit it then. Each line is therefore
+/// classified by its contents: keypoints are numbers only, in triples, which an image with a name
+/// is not. An ambiguous line (a name that is a number, or keypoints that look like ids) counts as
+/// keypoints if it follows an image.
 pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<SparseImage>, CaptureError> {
-    /// What the last line with anything on it, and an empty one after it, leave open.
+    /// State after the last non-blank line, and an empty one after it.
     #[derive(PartialEq)]
     enum Next {
         Keypoints,
@@ -135,13 +135,13 @@ pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<SparseImag
     })
 }
 
-/// The image of a line, or what is wrong with it.
+/// The image of a line, or the reason that it is none.
 fn image(mut fields: Fields<'_>) -> Result<SparseImage, String> {
     let id = fields.parsed("image id")?;
     let quaternion = fields.parsed_array("quaternion")?;
     let translation = fields.parsed_array("translation")?;
     let camera_id = fields.parsed("camera id")?;
-    // Nine fields precede the name; splitting again keeps the blanks inside it.
+    // Nine fields precede the name; splitting again preserves the blanks inside it.
     let name = nth_field_onwards(fields.record, 9);
     if name.is_empty() {
         return Err("its name is missing".to_owned());
@@ -155,11 +155,11 @@ fn image(mut fields: Fields<'_>) -> Result<SparseImage, String> {
     })
 }
 
-/// Whether a line is numbers only, three by three. Where it might be an `image` too, every third
+/// True if a line is numbers only, in triples. If it might be an `image` too, every third number
 /// must be whole, as ids are.
 fn are_keypoints(line: &str, image: bool) -> bool {
     let is_number = |field: &str| {
-        // Cheaper than parsing, and as good where nothing else fits the line.
+        // Cheaper than parsing, and sufficient if nothing else fits the line.
         let plain = |byte: u8| byte.is_ascii_digit() || b"+-.eE".contains(&byte);
         !image && field.bytes().all(plain) || field.parse::<f64>().is_ok()
     };
@@ -174,8 +174,8 @@ fn are_keypoints(line: &str, image: bool) -> bool {
     count % 3 == 0
 }
 
-/// Parses `points3D.txt`: `POINT3D_ID X Y Z R G B ERROR TRACK[]`; the track, pairs of an image id
-/// and a keypoint's index, is skipped, and may be left out with the error. `path` is for messages.
+/// Parses `points3D.txt`: `POINT3D_ID X Y Z R G B ERROR TRACK[]`. The track, pairs of an image id
+/// and a keypoint's index, is skipped; track and error are optional. `path` is used in messages.
 pub(super) fn parse_points(path: &Path, text: &[u8]) -> Result<Listed<Point>, CaptureError> {
     let file = File::new(path, text)?;
     let point = |mut fields: Fields<'_>| {
@@ -199,7 +199,7 @@ pub(super) fn parse_points(path: &Path, text: &[u8]) -> Result<Listed<Point>, Ca
     })
 }
 
-/// What is left of `line` after its first `count` fields, trimmed.
+/// Rest of `line` after its first `count` fields, trimmed.
 fn nth_field_onwards(line: &str, count: usize) -> &str {
     (0..count)
         .fold(line.trim_ascii_start(), |rest, _| {
@@ -224,7 +224,7 @@ impl<'a> File<'a> {
         Ok(Self { path, text })
     }
 
-    /// Lines that are no comment, empty ones too.
+    /// Lines that are not comments, including empty ones.
     fn lines(&self) -> impl Iterator<Item = Result<Fields<'a>, CaptureError>> {
         let path = self.path;
         let lines = lines(self.text).filter(|(_, line)| !line.starts_with(b"#"));
@@ -242,7 +242,7 @@ impl<'a> File<'a> {
         })
     }
 
-    /// Lines with a record.
+    /// Lines that contain a record.
     fn records(&self) -> impl Iterator<Item = Result<Fields<'a>, CaptureError>> {
         let is_record = |fields: &Result<Fields<'_>, _>| match fields {
             Ok(fields) => !fields.record.is_empty(),
@@ -298,7 +298,7 @@ impl<'a> Fields<'a> {
             .map_err(|reason| self.error(&reason))
     }
 
-    /// The next field, or what is wrong with it.
+    /// The next field, or the reason that it cannot be read.
     fn parsed<T: FromStr>(&mut self, field: &str) -> Result<T, String> {
         let Some(value) = self.fields.next() else {
             return Err(format!("its {field} is missing"));

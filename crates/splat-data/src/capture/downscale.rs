@@ -1,12 +1,11 @@
-//! Downscaling by a whole factor: the mean over blocks of `factor` x `factor` pixels.
+//! Downscaling by an integer factor: the mean over blocks of `factor` x `factor` pixels.
 
 /// Area-averages an 8-bit RGB image of `width` x `height` pixels by `factor`, to `floor(width /
-/// factor)` x `floor(height / factor)`. What is left over at the right and bottom edge is dropped.
+/// factor)` x `floor(height / factor)`. Remaining pixels at the right and bottom edge are dropped.
 ///
-/// The average is over the 8-bit values as they are (no gamma), rounded to nearest; this is the
-/// usual resampling of the field, and what published scores at reduced size rest on. With pixel
-/// centres at + 0.5 the intrinsics of the result are the original ones divided by `factor`, see
-/// [`intrinsics`].
+/// The average is taken over 8-bit values without gamma, and rounded to nearest. This is the usual
+/// resampling of the field, on which published scores at reduced size are based. With pixel centres
+/// at + 0.5 the intrinsics are divided by `factor`, see [`intrinsics`].
 pub(super) fn area_average(
     image: &[u8],
     width: u32,
@@ -15,7 +14,7 @@ pub(super) fn area_average(
 ) -> (Vec<u8>, u32, u32) {
     let (out_width, out_height) = (width / factor, height / factor);
     let (w, k) = (width as usize, factor as usize);
-    // Blocks of up to 2^32 pixels of 255 fit 64 bits easily.
+    // The sum over a block of up to 2^32 pixels of 255 fits into 64 bits.
     let area = (factor as u64).pow(2);
     let mut out = Vec::with_capacity(3 * out_width as usize * out_height as usize);
     for y in 0..out_height as usize {

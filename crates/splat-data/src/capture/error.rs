@@ -1,19 +1,19 @@
-//! What can be wrong with a capture, and what can be odd about it.
+//! Errors and warnings of captures.
 
 use std::fmt;
 use std::path::PathBuf;
 
 /// Why a capture cannot be used. Every message is one line that names the file and the record, and
-/// says what to do where that is not plain.
+/// says what to do where that is not obvious.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum CaptureError {
-    /// A file or folder could not be read, or written.
+    /// A file or folder could not be read or written.
     #[error("{}: {source}", path.display())]
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The capture's path is not a folder.
@@ -30,7 +30,7 @@ pub enum CaptureError {
     NoModel {
         /// The capture's folder.
         root: PathBuf,
-        /// What the folder seems to hold instead, or nothing.
+        /// What the folder seems to contain instead, if anything.
         hint: &'static str,
     },
     /// One of the three files of a model is missing.
@@ -49,7 +49,7 @@ pub enum CaptureError {
         /// The field being read.
         field: &'static str,
     },
-    /// A count in a file that the rest of the file has no room for.
+    /// A count that exceeds the rest of the file.
     #[error(
         "{}: {record} announces {count} {what}, but the {remaining} bytes that follow cannot hold them; the file is truncated or damaged",
         path.display()
@@ -59,14 +59,14 @@ pub enum CaptureError {
         path: PathBuf,
         /// The record that holds the count.
         record: String,
-        /// What is counted.
+        /// The counted items.
         what: &'static str,
         /// The count.
         count: u64,
         /// Bytes left in the file.
         remaining: usize,
     },
-    /// A binary file that goes on after its last record.
+    /// A binary file that continues after its last record.
     #[error(
         "{}: {remaining} bytes follow the {count} {what} that the file announces; it is damaged, or its count is wrong",
         path.display()
@@ -76,30 +76,30 @@ pub enum CaptureError {
         path: PathBuf,
         /// The count at its start.
         count: usize,
-        /// What is counted.
+        /// The counted items.
         what: &'static str,
         /// Bytes left in the file.
         remaining: usize,
     },
-    /// A text file in an encoding that is not read.
+    /// A text file in an unsupported encoding.
     #[error("{}: {reason}", path.display())]
     NotText {
         /// The file.
         path: PathBuf,
-        /// What it is instead, and what to do.
+        /// The encoding found, and what to do.
         reason: &'static str,
     },
-    /// A record that cannot be understood or makes no sense.
+    /// A record that cannot be parsed or makes no sense.
     #[error("{}: {record}: {reason}", path.display())]
     BadRecord {
         /// The file.
         path: PathBuf,
         /// The record, such as `image 3 of 32` or `line 7`.
         record: String,
-        /// What is wrong with it.
+        /// The reason.
         reason: String,
     },
-    /// A camera model with distortion or of another kind.
+    /// A camera model with distortion or of another unsupported kind.
     #[error(
         "{}: camera {camera_id} has the model {model}; only PINHOLE and SIMPLE_PINHOLE can be read, undistort the photos first (`colmap image_undistorter`)",
         path.display()
@@ -127,7 +127,7 @@ pub enum CaptureError {
         /// The points file.
         path: PathBuf,
     },
-    /// The folder given for the photos is not there.
+    /// The folder given for the photos does not exist.
     #[error(
         "{}: no such folder of photos (--images); give it relative to the capture, or whole{}",
         path.display(),
@@ -141,7 +141,7 @@ pub enum CaptureError {
         /// Another folder of the capture that holds photos of the model, relative to the capture.
         elsewhere: Option<PathBuf>,
     },
-    /// The photo of an image of the model is not there.
+    /// The photo of an image of the model does not exist.
     #[error(
         "{}: no such photo, but the model names the image `{image}`; {}",
         path.display(),
@@ -154,15 +154,15 @@ pub enum CaptureError {
         }
     )]
     MissingPhoto {
-        /// Where the photo should be.
+        /// Expected path of the photo.
         path: PathBuf,
         /// Name of the image in the model.
         image: String,
-        /// Another folder of the capture, relative to it, that holds more photos of the model, and
-        /// how many.
+        /// Another folder of the capture, relative to it, that holds more photos of the model, with
+        /// their number.
         elsewhere: Option<(PathBuf, usize)>,
     },
-    /// A photo of which a part is missing, which decoders make up.
+    /// A photo with a missing part, which decoders would invent.
     #[error(
         "{}: {reason}; the rest would be made up: restore the photo, or remove its image from the model",
         path.display()
@@ -170,7 +170,7 @@ pub enum CaptureError {
     IncompletePhoto {
         /// The photo.
         path: PathBuf,
-        /// What is missing.
+        /// The missing part.
         reason: String,
     },
     /// A photo that cannot be decoded.
@@ -178,10 +178,10 @@ pub enum CaptureError {
     UndecodablePhoto {
         /// The photo.
         path: PathBuf,
-        /// What the decoder said.
+        /// The decoder's message.
         reason: String,
     },
-    /// The photos together need more memory than there is.
+    /// The photos together need more memory than is available.
     #[error(
         "{}: {photos} photos need {:.1} GB of memory, and {:.1} GB are left; read them smaller (--downscale, now {downscale})",
         root.display(), *needed as f64 / 1e9, *left as f64 / 1e9
@@ -189,16 +189,16 @@ pub enum CaptureError {
     OutOfMemory {
         /// The capture's folder.
         root: PathBuf,
-        /// How many they are.
+        /// Number of photos.
         photos: usize,
         /// Bytes of their pixels.
         needed: u64,
-        /// Bytes that this process can still get.
+        /// Bytes that this process can still allocate.
         left: u64,
-        /// The factor by which they were to be averaged.
+        /// The requested downscale factor.
         downscale: u32,
     },
-    /// A photo whose shape is not that of its camera.
+    /// A photo whose aspect ratio differs from its camera's.
     #[error(
         "{}: the photo is {}x{} pixels, but its camera {camera_id} is {}x{}; {}",
         path.display(), photo[0], photo[1], camera[0], camera[1],
@@ -218,7 +218,7 @@ pub enum CaptureError {
         /// The camera's width and height.
         camera: [u32; 2],
     },
-    /// A photo too small to compare by SSIM.
+    /// A photo too small for SSIM.
     #[error(
         "{}: the photo is {}x{} pixels{}; at least {min}x{min} are needed, the window of SSIM",
         path.display(), size[0], size[1],
@@ -231,18 +231,18 @@ pub enum CaptureError {
         size: [u32; 2],
         /// The downscale factor.
         downscale: u32,
-        /// Least width and height.
+        /// Smallest width and height.
         min: u32,
     },
-    /// A `split.json` that cannot be used.
+    /// An unusable `split.json`.
     #[error("{}: {reason}", path.display())]
     BadSplit {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The reason.
         reason: String,
     },
-    /// No view is left to train on.
+    /// No view is left for training.
     #[error(
         "{}: nothing to train on: of {photos} photo(s) all are held out; at least 2 are needed, since every 8th from the first is held out (or name a split in split.json)",
         root.display()
@@ -258,7 +258,7 @@ pub enum CaptureError {
     ZeroDownscale,
 }
 
-/// Something odd about a capture that did not prevent reading it. `Display` gives one line.
+/// A problem that did not prevent reading the capture. `Display` gives one line.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum CaptureWarning {
@@ -274,26 +274,25 @@ pub enum CaptureWarning {
         /// Its camera's width and height.
         camera: [u32; 2],
     },
-    /// Photos with transparent pixels; they were put on black.
+    /// Photos with transparent pixels; they were composited on black.
     TransparentPhotos {
         /// Number of such photos.
         count: usize,
         /// The first of them.
         first: String,
     },
-    /// A text file of the model lists more or less than its comments announce.
+    /// A text file of the model lists more or fewer records than its comments announce.
     Miscounted {
         /// The file.
         path: PathBuf,
-        /// What it lists.
+        /// The listed items.
         what: &'static str,
         /// The number in the comments.
         announced: u64,
         /// The number of records.
         read: usize,
     },
-    /// JPEG files with more data than their picture takes, or less detail than they were begun
-    /// with.
+    /// JPEG files with more data than their picture needs, or less detail than announced.
     DamagedPhotos {
         /// Number of such photos.
         count: usize,
@@ -311,7 +310,7 @@ pub enum CaptureWarning {
     OtherModels {
         /// The folder that was read.
         used: PathBuf,
-        /// How many others lie beside it.
+        /// Number of other models beside it.
         others: usize,
     },
     /// `split.json` names photos that the capture does not have.
@@ -321,7 +320,7 @@ pub enum CaptureWarning {
         /// The first of them.
         first: String,
     },
-    /// `split.json` puts photos in neither list; they are not used.
+    /// `split.json` leaves photos out of both lists; they are not used.
     SplitLeavesOut {
         /// Number of such photos.
         count: usize,

@@ -1,16 +1,16 @@
-//! What a format of captures is.
+//! The interface of a capture format.
 
 use std::path::Path;
 
 use super::sparse_model::SparseModel;
 use super::{CaptureError, CaptureWarning};
 
-/// A model and what is odd about it, or why there is none.
+/// A model with its warnings, or the reason that there is none.
 pub(super) type ReadModel = Result<(SparseModel, Vec<CaptureWarning>), CaptureError>;
 
-/// A way to store cameras, images and points.
+/// A way of storing cameras, images and points.
 pub(super) struct CaptureFormat {
-    /// Whether the folder holds a capture in it, as far as names of files tell.
+    /// True if the folder holds a capture in this format, judged by file names.
     pub is_in: fn(&Path) -> bool,
     /// Reads and checks the cameras, images and points of the folder.
     pub read: fn(&Path) -> ReadModel,

@@ -1,15 +1,14 @@
-//! The formats of captures, and which of them a folder holds.
+//! The capture formats, and detection of a folder's format.
 
 use std::path::Path;
 
 use super::colmap;
 use super::format::{CaptureFormat, ReadModel};
 
-/// Every format; the first that fits is read.
+/// All formats; the first that matches is read.
 const FORMATS: &[CaptureFormat] = &[colmap::FORMAT];
 
-/// Reads the folder in the format that it holds. Where it holds none, the error is that of the
-/// first.
+/// Reads the folder in the format that matches. If none does, returns the error of the first.
 pub(super) fn read(root: &Path) -> ReadModel {
     let format = FORMATS.iter().find(|format| (format.is_in)(root));
     (format.unwrap_or(&FORMATS[0]).read)(root)

@@ -1,4 +1,4 @@
-//! Photos: found, decoded once and in parallel, fitted to their cameras, kept as 8-bit RGB.
+//! Photos: found, decoded once in parallel, matched to their cameras, and kept as 8-bit RGB.
 
 mod folders;
 
@@ -13,7 +13,7 @@ use splat_core::memory::available_memory;
 use super::sparse_model::{SparseCamera, SparseImage, SparseModel};
 use super::{CaptureError, CaptureSettings, CaptureWarning, View, downscale, jpeg};
 
-/// Least width and height of a photo: the window of SSIM.
+/// Smallest width and height of a photo: the window of SSIM.
 pub(super) const MIN_SIDE: u32 = 11;
 
 /// The folder of the photos.
@@ -25,7 +25,7 @@ pub(super) fn folder(
     folders::of_photos(root, options.images.as_deref(), model)
 }
 
-/// Loads the photo of every image of the model. The views come in the order of the model's images.
+/// Loads the photo of every image of the model. The views are in the order of the model's images.
 pub(super) fn load(
     root: &Path,
     folder: &Path,
@@ -33,7 +33,7 @@ pub(super) fn load(
     options: &CaptureSettings,
     warnings: &mut Vec<CaptureWarning>,
 ) -> Result<Vec<View>, CaptureError> {
-    // Look for every photo before decoding any: the likeliest mistake is found at once.
+    // Look for every photo before decoding any, so that the likeliest mistake is found at once.
     for image in &model.images {
         let path = folder.join(&image.name);
         if !path.is_file() {
@@ -59,7 +59,7 @@ pub(super) fn load(
     Ok(loaded.into_iter().map(|loaded| loaded.view).collect())
 }
 
-/// Refuses photos that memory could not hold: the allocation that failed would end the process.
+/// Refuses photos that would not fit into memory; a failed allocation would end the process.
 pub(super) fn check_memory(
     root: &Path,
     folder: &Path,
@@ -76,8 +76,8 @@ pub(super) fn check_memory(
         bytes([camera.width, camera.height])
     };
     let Some(left) = left else { return Ok(()) };
-    // Photos may have another size than their cameras; but to look at each takes time, and mostly
-    // there is far more memory than they take.
+    // Photos may differ in size from their cameras. Looking at each takes time and is skipped if
+    // memory is ample.
     const AMPLE: u64 = 64;
     let by_cameras = model.images.iter().map(of_camera);
     if by_cameras.fold(0, u64::saturating_add) <= left / AMPLE {
@@ -85,10 +85,10 @@ pub(super) fn check_memory(
     }
     let size = |path: &Path| -> Option<(u32, u32)> {
         let reader = ImageReader::open(path).ok()?;
-        // By what is in the file, whatever its name.
+        // Detects the format from the contents, not the name.
         reader.with_guessed_format().ok()?.into_dimensions().ok()
     };
-    // What cannot be read is told when it is decoded.
+    // Unreadable photos are reported when they are decoded.
     let of_photo = |image: &SparseImage| {
         size(&folder.join(&image.name)).map_or(0, |(width, height)| bytes([width, height]))
     };
@@ -106,13 +106,13 @@ pub(super) fn check_memory(
     })
 }
 
-/// A view and what was odd about its photo.
+/// A view with the warnings about its photo.
 struct Loaded {
     view: View,
     transparent: bool,
-    /// Whether its file is likely damaged, though its picture is whole.
+    /// True if the file is likely damaged, although its picture is complete.
     suspect: bool,
-    /// Sizes of photo and camera where they differ.
+    /// Sizes of photo and camera if they differ.
     rescaled: Option<[[u32; 2]; 2]>,
 }
 
@@ -166,7 +166,7 @@ fn load_one(
     })
 }
 
-/// A photo's file in memory.
+/// A photo file in memory.
 struct PhotoFile {
     bytes: Vec<u8>,
     format: ImageFormat,
@@ -189,9 +189,8 @@ impl PhotoFile {
             .map_err(|error| undecodable(path, &error))
     }
 
-    /// Refuses a photo of which a part is missing, where the decoder would not; whether the file
-    /// looks damaged all the same. (Of a PNG file every part has a checksum, which the decoder
-    /// checks.)
+    /// Refuses a photo with a missing part that the decoder would accept; returns true if the file
+    /// looks damaged anyway. (PNG files have checksums, which the decoder verifies.)
     fn check_whole(&mut self, path: &Path) -> Result<bool, CaptureError> {
         if self.format != ImageFormat::Jpeg {
             return Ok(false);
@@ -201,13 +200,13 @@ impl PhotoFile {
             reason,
         })?;
         if !whole.ended {
-            // Without it the decoder makes up the last rows although they are there.
+            // Without the end marker the decoder invents the last rows, although they are present.
             self.bytes.extend(jpeg::END);
         }
         Ok(whole.suspect)
     }
 
-    /// The photo as stored: like COLMAP, without turning it by its EXIF orientation.
+    /// The photo as stored. Like COLMAP, this ignores EXIF orientation.
     fn decode(&self, path: &Path) -> Result<DynamicImage, CaptureError> {
         self.reader()
             .decode()
@@ -226,12 +225,11 @@ fn undecodable(path: &Path, error: &ImageError) -> CaptureError {
     }
 }
 
-/// The camera's intrinsics for a photo of `size`, or nothing where the photo's shape is not the
-/// camera's.
+/// The camera's intrinsics for a photo of `size`, or `None` if the aspect ratios differ.
 ///
-/// A rescale counts as uniform where one factor explains both sides to within a pixel (sizes are
-/// rounded). The sides are then scaled each by its own ratio, so that the photo's edges stay the
-/// camera's edges.
+/// A rescale counts as uniform if one factor explains both sides to within a pixel (sizes are
+/// rounded). Each side is then scaled by its own ratio, so that the photo's edges stay the camera's
+/// edges.
 fn fit_intrinsics(camera: &SparseCamera, size: [u32; 2]) -> Option<[f64; 4]> {
     let [fx, fy, cx, cy] = camera.intrinsics;
     let [w, h] = size.map(f64::from);
@@ -242,7 +240,7 @@ fn fit_intrinsics(camera: &SparseCamera, size: [u32; 2]) -> Option<[f64; 4]> {
     (least <= most).then_some([fx * sx, fy * sy, cx * sx, cy * sy])
 }
 
-/// 8-bit RGB, transparent pixels put on black; and whether there were any.
+/// 8-bit RGB with transparent pixels composited on black; and whether there were any.
 fn opaque_rgb(photo: DynamicImage) -> (Vec<u8>, bool) {
     if !photo.color().has_alpha() {
         return (photo.into_rgb8().into_raw(), false);

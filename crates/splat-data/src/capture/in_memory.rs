@@ -1,5 +1,5 @@
-//! A capture of grey photos from the content of a model's files, for whoever has no folder: fuzz
-//! targets and the tests that come of them.
+//! A capture of grey photos from the contents of a model's files, for callers without a folder:
+//! fuzz targets and their regression tests.
 
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -8,10 +8,10 @@ use super::colmap;
 use super::sparse_model::{SparseImage, SparseModel};
 use super::{Capture, CaptureError, Split, View, images};
 
-/// Photos have the size of their camera where it is smaller than this.
+/// Photos have the size of their camera, up to this limit.
 const LARGEST_SIDE: u32 = 24;
 
-/// Reads and checks a model, binary or text, from the content of its cameras, images and points.
+/// Reads and checks a model, binary or text, from the contents of its cameras, images and points.
 ///
 /// # Errors
 /// Those of the readers, see [`CaptureError`].

@@ -1,9 +1,9 @@
-//! Whether a JPEG file holds all of its picture.
+//! Checks that a JPEG file contains its whole picture.
 //!
-//! Decoders make up what is missing: where a file is cut off they paint grey, and where its data
-//! end early they go on with bits of value 0, without an error. So the coded data are walked here,
-//! block by block (ITU T.81), for nothing but their length. JPEG has no checksums: damage in the
-//! middle is noticed where it puts the data out of step, which is most often.
+//! Decoders invent missing data without an error: they paint grey after a truncation, and continue
+//! with zero bits if the data end early. This module therefore walks the coded data block by block
+//! (ITU T.81), only to find their length. JPEG has no checksums; damage in the middle is noticed if
+//! it puts the data out of step, which it usually does.
 
 mod bits;
 mod scan;
@@ -13,22 +13,20 @@ use scan::{BLOCK, Component, Frame, Member, Scan, UNSENT, Unfinished};
 
 /// The two bytes that end a picture.
 pub(super) const END: [u8; 2] = [0xff, 0xd9];
-/// Scans of a picture that are walked at most: each costs time however short it is. Encoders make
-/// 10 or so.
+/// Most scans that are walked: each costs time, however short. Encoders write about 10.
 const MOST_SCANS: usize = 100;
 
-/// What a file that holds all of its picture has besides.
+/// Properties of a file that contains its whole picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Whole {
-    /// The picture ends as it should, with [`END`]. Where it does not, all of it is there
-    /// nevertheless.
+    /// True if the picture ends with [`END`]. If not, it is complete nevertheless.
     pub ended: bool,
-    /// More picture data than the picture has, or an end before the scans with its detail: the file
-    /// is likely damaged.
+    /// The file is likely damaged: more data than the picture needs, or an end before the scans
+    /// with its detail.
     pub suspect: bool,
 }
 
-/// Walks the file; an error says in words what is missing.
+/// Walks the file; an error says what is missing.
 ///
 /// Needs at most 64 bytes of memory for every byte of the file.
 pub(super) fn check(bytes: &[u8]) -> Result<Whole, String> {
@@ -41,7 +39,7 @@ pub(super) fn check(bytes: &[u8]) -> Result<Whole, String> {
         match bits.marker() {
             None => break false,
             Some(0xd9) => break true,
-            // Start of image, restarts, and the one other marker without a length.
+            // Start of image, restarts, and the only other marker without a length.
             Some(0xd0..=0xd8 | 0x01) => continue,
             Some(marker) => {
                 let Some(segment) = bits.segment() else {
@@ -54,7 +52,7 @@ pub(super) fn check(bytes: &[u8]) -> Result<Whole, String> {
     picture.whole(ended)
 }
 
-/// What is known of a picture so far.
+/// State of the picture so far.
 #[derive(Default)]
 struct Picture {
     frame: Option<Frame>,
@@ -66,7 +64,7 @@ struct Picture {
 }
 
 impl Picture {
-    /// Takes in a segment, and the coded data behind it if it starts a scan.
+    /// Processes a segment, and the coded data after it if it starts a scan.
     fn read(&mut self, marker: u8, segment: &[u8], bits: &mut Bits<'_>) -> Result<(), String> {
         let bad = |what: &str| format!("its {what} is damaged");
         match marker {
@@ -76,7 +74,7 @@ impl Picture {
             }
             0xc0..=0xc2 => {
                 let frame = frame(segment, marker == 0xc2).ok_or_else(|| bad("header"))?;
-                // Every block of a picture takes a bit at least. This also bounds the memory.
+                // Every block takes at least one bit, which also bounds the memory.
                 let blocks = frame.blocks();
                 if blocks.div_ceil(8) > bits.file_len() {
                     return Err(format!(
@@ -100,7 +98,7 @@ impl Picture {
         Ok(())
     }
 
-    /// Huffman tables: class and place, 16 counts, symbols; and again.
+    /// Huffman tables: class and slot, 16 counts, symbols; repeated.
     fn tables(&mut self, mut segment: &[u8]) -> Option<()> {
         while let Some((&[class_and_place, ref counts @ ..], rest)) =
             segment.split_first_chunk::<17>()
@@ -136,7 +134,7 @@ impl Picture {
         Ok(())
     }
 
-    /// Whether everything was sent.
+    /// Checks that everything was sent.
     fn whole(&self, ended: bool) -> Result<Whole, String> {
         let components = self
             .frame
@@ -173,7 +171,7 @@ impl Frame {
         self.components.iter().map(|c| c.across * c.down).sum()
     }
 
-    /// With room for what later scans depend on.
+    /// Reserves memory for the state that later scans depend on.
     fn with_room(mut self) -> Self {
         if self.progressive {
             for component in &mut self.components {
@@ -262,12 +260,13 @@ fn scan_of<'a>(
         restart,
     };
     if !frame.progressive {
-        // A sequential picture sends everything at once, whatever is written here.
+        // A sequential picture sends everything at once, regardless of these fields.
         (scan.first, scan.last, scan.high, scan.low) = (0, BLOCK - 1, 0, 0);
     } else if scan.last >= BLOCK || scan.first > scan.last {
         return None;
     } else if scan.first == 0 && scan.last > 0 || scan.first > 0 && scan.members.len() > 1 {
-        // The mean of a block is sent apart from the rest, and the rest by one component at a time.
+        // The mean of a block is sent separately from the rest, and the rest by one component at a
+        // time.
         return None;
     }
     (1..=4).contains(&scan.members.len()).then_some(scan)

@@ -1,13 +1,12 @@
-//! Captures: photos with their cameras and the points that structure from motion found.
+//! Captures: photos with their cameras and the points from structure from motion.
 //!
-//! [`Capture::load`] reads a folder in COLMAP's layout, decodes every photo once and in parallel,
-//! and returns plain data: nothing here knows a tensor or prints a line. What is odd but usable
-//! comes back as [`Capture::warnings`]; what is not is a [`CaptureError`] that names the file, the
-//! record and what to do.
+//! [`Capture::load`] reads a folder in COLMAP's layout, decodes every photo once in parallel, and
+//! returns plain data, without tensors or printed output. Problems that can be tolerated are
+//! returned as [`Capture::warnings`]; others are a [`CaptureError`] that names the file, the record
+//! and the remedy.
 //!
-//! Conventions (those of the whole project): right-handed world; camera axes +x right, +y down, +z
-//! forward; the view matrix maps world to camera; the centre of pixel (i, j) lies at (i + 0.5, j +
-//! 0.5).
+//! Conventions (project-wide): right-handed world; camera axes +x right, +y down, +z forward; the
+//! view matrix maps world to camera; the centre of pixel (i, j) is at (i + 0.5, j + 0.5).
 
 mod colmap;
 mod colmap_binary;
@@ -38,8 +37,8 @@ use crate::Camera;
 pub use error::{CaptureError, CaptureWarning};
 pub use split::Split;
 
-/// A photo capture, whole in memory: every photo with its camera, the sparse points, and which
-/// views are held out.
+/// A photo capture in memory: all photos with their cameras, the sparse points, and the held-out
+/// split.
 #[derive(Debug, Clone)]
 pub struct Capture {
     /// Name of the capture's folder.
@@ -52,16 +51,16 @@ pub struct Capture {
     pub views: Vec<View>,
     /// Points of structure from motion, in file order. Never empty.
     pub points: Vec<Point>,
-    /// Indices into [`Capture::views`]: to train on, and held out.
+    /// Indices into [`Capture::views`]: for training, and held out.
     pub split: Split,
-    /// What is odd about the capture but did not prevent reading it.
+    /// Problems that did not prevent reading.
     pub warnings: Vec<CaptureWarning>,
 }
 
 /// One photo and the pinhole camera that took it.
 #[derive(Debug, Clone)]
 pub struct View {
-    /// Name of the photo as the capture gives it, relative to the folder of the photos.
+    /// Name of the photo in the capture, relative to the folder of the photos.
     pub name: String,
     /// Width of `image` in pixels.
     pub width: u32,
@@ -86,14 +85,14 @@ pub struct Point {
     pub color: [u8; 3],
 }
 
-/// How to read a capture.
+/// Settings for reading a capture.
 #[derive(Debug, Clone, PartialEq, Eq, Setters)]
 #[setters(prefix = "with_", strip_option)]
 pub struct CaptureSettings {
-    /// Area-average every photo by this factor, at least 1 (1: as it is). Default 1.
+    /// Factor by which every photo is area-averaged, at least 1. Default 1.
     pub downscale: u32,
-    /// Folder of the photos, relative to the capture's or absolute. Default: `images`, or the
-    /// capture's own folder where there is no `images`.
+    /// Folder of the photos, relative to the capture or absolute. Default: `images`, or the
+    /// capture's folder if that does not exist.
     pub images: Option<PathBuf>,
 }
 
@@ -116,16 +115,15 @@ impl Default for CaptureSettings {
 impl Capture {
     /// Reads the capture in the folder `root`.
     ///
-    /// The COLMAP model is looked for in `sparse/0`, then `sparse`, then `root` itself, binary
-    /// before text; the photos in [`CaptureSettings::images`]. Cameras must be `PINHOLE` or
-    /// `SIMPLE_PINHOLE`. Photos are decoded in parallel; where a photo's size is a uniform rescale
-    /// of its camera's, the intrinsics follow the photo and a warning says so. A photo of which a
-    /// part is missing is refused. The held-out views are those `split.json` names, or else every
-    /// 8th by name from the first.
+    /// The COLMAP model is searched in `sparse/0`, `sparse` and `root`, binary before text; the
+    /// photos in [`CaptureSettings::images`]. Cameras must be `PINHOLE` or `SIMPLE_PINHOLE`. If a
+    /// photo's size is a uniform rescale of its camera's, the intrinsics are scaled to the photo,
+    /// with a warning. Photos with a missing part are refused. The held-out views are those named
+    /// by `split.json`, or else every 8th by name from the first.
     ///
-    /// Reading the model takes less than 32 times the memory of its files, a JPEG file 64 times
-    /// (while it is read); the pixels of the photos come on top, three bytes each, and up to twelve
-    /// while a photo is decoded.
+    /// Reading a model takes less than 32 times the memory of its files, and a JPEG file 64 times,
+    /// while it is read. The pixels of the photos take three bytes each in addition, and up to
+    /// twelve while a photo is decoded.
     ///
     /// ```
     /// use splat_data::{Capture, CaptureSettings};
@@ -138,8 +136,8 @@ impl Capture {
     ///
     /// # Errors
     ///
-    /// Whatever makes the capture unusable, see [`CaptureError`]. A capture of a single photo is
-    /// read: whether there is anything to train on is for [`Capture::check_trainable`].
+    /// [`CaptureError`] if the capture is unusable. A capture of a single photo can be read;
+    /// [`Capture::check_trainable`] decides whether it can be trained.
     pub fn load(root: impl AsRef<Path>, options: &CaptureSettings) -> Result<Self, CaptureError> {
         let root = root.as_ref();
         if options.downscale == 0 {
@@ -165,7 +163,7 @@ impl Capture {
     ///
     /// # Errors
     ///
-    /// [`CaptureError::NothingToTrainOn`], which is what the usual split leaves of a single photo.
+    /// [`CaptureError::NothingToTrainOn`], for example for a single photo under the default split.
     pub fn check_trainable(&self) -> Result<(), CaptureError> {
         if self.split.train.is_empty() {
             return Err(CaptureError::NothingToTrainOn {
@@ -176,23 +174,23 @@ impl Capture {
         Ok(())
     }
 
-    /// The files of the photos, in the order of the views.
+    /// Files of the photos, in the order of the views.
     pub fn photo_files(&self) -> Vec<PathBuf> {
         let file = |view: &View| self.photos.join(&view.name);
         self.views.iter().map(file).collect()
     }
 
-    /// The views to train on, in the order of their names.
+    /// Views for training, sorted by name.
     pub fn train_views(&self) -> impl ExactSizeIterator<Item = &View> {
         self.split.train.iter().map(|&index| &self.views[index])
     }
 
-    /// The held-out views, in the order of their names.
+    /// Held-out views, sorted by name.
     pub fn test_views(&self) -> impl ExactSizeIterator<Item = &View> {
         self.split.test.iter().map(|&index| &self.views[index])
     }
 
-    /// Number of photos of each size, `(width, height, count)`, the most frequent first.
+    /// Number of photos of each size, `(width, height, count)`, most frequent first.
     pub fn image_sizes(&self) -> Vec<(u32, u32, usize)> {
         let mut counts = HashMap::new();
         for view in &self.views {
@@ -208,7 +206,7 @@ impl Capture {
 }
 
 impl View {
-    /// Its camera.
+    /// Camera of the view.
     pub fn camera(&self) -> Camera {
         let [r0, r1, r2, r3] = self.viewmat.map(DVec4::from_array);
         Camera {
@@ -221,8 +219,8 @@ impl View {
         }
     }
 
-    /// The view with its photo area-averaged by `factor`, as [`CaptureSettings::downscale`] has it,
-    /// or by the largest power of two below it that leaves both sides at least as long as SSIM's
+    /// The view with its photo area-averaged by `factor`, as in [`CaptureSettings::downscale`], or
+    /// by the largest smaller power of two that leaves both sides at least as long as SSIM's
     /// window.
     pub fn downscaled(&self, factor: u32) -> Self {
         let mut factor = factor;
@@ -249,8 +247,8 @@ impl View {
         }
     }
 
-    /// Where a world point falls in the photo, `(x, y)` in pixels, and its depth along the camera's
-    /// axis. Points at depth 0 have no finite place.
+    /// Position of a world point in the photo, `(x, y)` in pixels, and its depth along the camera's
+    /// axis. Points at depth 0 have no finite position.
     pub fn project(&self, point: [f64; 3]) -> ([f64; 2], f64) {
         let [x, y, z]: [f64; 3] = std::array::from_fn(|row| {
             let r = &self.viewmat[row];

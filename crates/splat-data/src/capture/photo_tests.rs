@@ -1,4 +1,4 @@
-//! What is promised of photos: each is whole or refused, wherever they lie.
+//! Promises about photos: each is complete or refused, wherever it is stored.
 
 use std::io::Cursor;
 use std::path::{Path, PathBuf};
@@ -32,7 +32,7 @@ fn load_from(root: &Path, images: &Path) -> Result<Capture, CaptureError> {
     Capture::load(root, &options)
 }
 
-/// A photo that no decoder guesses, as a file of this format (the file's name does not matter).
+/// A photo with unpredictable pixels, in a file of this format (whatever the file's name).
 fn photo(format: ImageFormat) -> Vec<u8> {
     let [w, h] = SIZES[0];
     let noise = |x: u32, y: u32| [x * y * 7, x * x + 3 * y, x ^ (y * 11)].map(|v| v as u8);
@@ -42,7 +42,7 @@ fn photo(format: ImageFormat) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// By the photos' sizes, where their cameras' are larger.
+/// Measured by the photos' sizes if their cameras' are larger.
 #[test]
 fn photos_that_memory_cannot_hold_are_refused_before_they_are_read() {
     let (root, _) = good();
@@ -96,7 +96,7 @@ fn a_part_of_a_photo_is_refused_by_name() {
                 }
             }
         }
-        // All but what comes after the last pixel.
+        // Everything except what follows the last pixel.
         assert!(
             refused + 16 >= bytes.len(),
             "{format:?}: {refused} of {}",
@@ -115,7 +115,7 @@ fn a_photo_with_too_much_in_it_is_told() {
         .position(|pair| pair == [0xff, 0xc0])
         .unwrap();
     assert_eq!(bytes[header + 5..header + 9], [0, 24, 0, 32]);
-    // Half as wide and high, by the header.
+    // Half the width and height in the header.
     bytes[header + 6] = 12;
     bytes[header + 8] = 16;
     std::fs::write(&path, bytes).unwrap();
@@ -150,7 +150,7 @@ fn photos_are_read_from_the_folder_that_is_named() {
         assert_eq!(pixels(&capture), pixels(&usual));
         assert_eq!(capture.views[0].name, FIRST);
     }
-    // And from anywhere else.
+    // And from any other directory.
     let elsewhere = TempDir::new().unwrap();
     let elsewhere = elsewhere.path().join("photos");
     std::fs::create_dir_all(&elsewhere).unwrap();
@@ -175,7 +175,7 @@ fn another_folder_with_the_photos_is_suggested() {
         assert!(!message.contains('\n'), "{message}");
         message
     };
-    // No folder of the usual name, an empty one, and one with a few of them.
+    // No folder of the usual name, an empty one, and one with a few photos.
     suggested(load(root.path()).unwrap_err());
     std::fs::create_dir(&images).unwrap();
     suggested(load(root.path()).unwrap_err());
@@ -186,7 +186,7 @@ fn another_folder_with_the_photos_is_suggested() {
     let message = suggested(load_from(root.path(), "nowhere".as_ref()).unwrap_err());
     assert!(message.contains("nowhere"), "{message}");
 
-    // Beside the model.
+    // Photos beside the model.
     std::fs::remove_dir_all(&images).unwrap();
     std::fs::create_dir(&images).unwrap();
     for entry in std::fs::read_dir(root.path().join("images_2")).unwrap() {
@@ -197,14 +197,14 @@ fn another_folder_with_the_photos_is_suggested() {
     assert!(message.contains("the folder `.`"), "{message}");
     load_from(root.path(), ".".as_ref()).unwrap();
 
-    // Nothing is suggested that is not there.
+    // Nothing is suggested that does not exist.
     let bare = TempDir::new().unwrap();
     TestCapture::new().write_binary(&bare.path().join("sparse/0"));
     let message = load(bare.path()).unwrap_err().to_string();
     assert!(!message.contains("--images"), "{message}");
 }
 
-/// The first of the photos that the model does not name, and how many there are.
+/// The first photo that the model does not name, and the number of such photos.
 fn left_out(root: &Path) -> Option<(String, usize)> {
     load(root)
         .unwrap()
@@ -220,7 +220,7 @@ fn left_out(root: &Path) -> Option<(String, usize)> {
 fn photos_that_the_model_does_not_name_are_counted_in_sub_folders_too() {
     let (root, mut model) = good();
     let images = root.path().join("images");
-    // Masks beside a model of photos in one folder are none of its photos.
+    // Masks beside a model with photos in one folder are not photos of it.
     std::fs::create_dir(images.join("masks")).unwrap();
     std::fs::write(images.join("masks/a.png"), []).unwrap();
     assert_eq!(left_out(root.path()), None);
@@ -229,7 +229,7 @@ fn photos_that_the_model_does_not_name_are_counted_in_sub_folders_too() {
     }
     assert_eq!(left_out(root.path()), Some(("a.png".to_owned(), 2)));
 
-    // Of a rig of cameras with a folder each, one may be missing.
+    // In a rig with a folder per camera, one camera may be missing.
     std::fs::remove_dir_all(&images).unwrap();
     for (_, _, _, camera, name) in &mut model.images {
         let folder = format!("cam{camera}");

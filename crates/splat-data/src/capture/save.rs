@@ -1,5 +1,5 @@
-//! Writes a capture into a folder as [`Capture::load`] and COLMAP read it: photos, a binary model,
-//! and the split.
+//! Writes a capture to a folder in the form that [`Capture::load`] and COLMAP read: photos, a
+//! binary model, and the split.
 
 use std::io::{Cursor, Error, ErrorKind};
 use std::path::Path;
@@ -15,13 +15,14 @@ const PINHOLE: i32 = 1;
 
 impl Capture {
     /// Writes the capture to the folder `root`: `images/`, `sparse/0/*.bin` with a PINHOLE camera
-    /// for every view, and `split.json`. Photos are written as PNG, whatever their names end in.
-    /// The model comes last, so that without it the folder is not taken for whole.
+    /// per view, and `split.json`. Photos are written as PNG, whatever their names end in. The
+    /// model is written last, so that an incomplete folder is not taken for a capture.
     ///
     /// # Errors
     ///
-    /// [`CaptureError::Io`] if there is a model in `root` already, which may be all that is left of
-    /// somebody's photos, if a file cannot be written, or if a view's `image` is not of its size.
+    /// [`CaptureError::Io`] if `root` already contains a model (the only remains of somebody's
+    /// photos, perhaps), if a file cannot be written, or if the length of a view's `image` does not
+    /// match its size.
     pub fn save(&self, root: &Path) -> Result<(), CaptureError> {
         let model = root.join("sparse");
         if model.exists() {
@@ -73,7 +74,7 @@ impl Capture {
         let mut out = count(self.views.len());
         for (id, view) in (1u32..).zip(&self.views) {
             let [[a, b, c, x], [d, e, f, y], [g, h, i, z], _] = view.viewmat;
-            // By columns.
+            // Column-major.
             let rotation = DMat3::from_cols_array(&[a, d, g, b, e, h, c, f, i]);
             let DQuat {
                 x: qx,
@@ -99,7 +100,7 @@ impl Capture {
             out.extend(id.to_le_bytes());
             out.extend(point.position.iter().flat_map(|value| value.to_le_bytes()));
             out.extend(point.color);
-            // No error is known, and no photo that shows it.
+            // The error is unknown, and no photo shows the point.
             out.extend((-1.0f64).to_le_bytes());
             out.extend(count(0));
         }
@@ -107,7 +108,7 @@ impl Capture {
     }
 }
 
-/// As COLMAP begins a list.
+/// A count as COLMAP writes it at the start of a list.
 fn count(length: usize) -> Vec<u8> {
     (length as u64).to_le_bytes().to_vec()
 }
@@ -139,7 +140,7 @@ mod tests {
     use crate::CaptureSettings;
     use crate::capture::test_capture::TestCapture;
 
-    /// Nine photos by two cameras: what was written is what was read.
+    /// Nine photos from two cameras survive a round trip.
     #[test]
     fn a_capture_is_read_as_it_was_written() {
         let [from, to] = [(); 2].map(|()| tempfile::tempdir().unwrap());
@@ -168,7 +169,7 @@ mod tests {
             }
         }
 
-        // Nothing is written over.
+        // Nothing is overwritten.
         let error = capture.save(from.path()).unwrap_err().to_string();
         assert!(error.contains("sparse: there is a capture"), "{error}");
         assert!(!from.path().join("split.json").exists());

@@ -1,11 +1,11 @@
-//! What every format of captures is read into: cameras, images and points.
+//! The common result of all capture formats: cameras, images and points.
 
 use std::collections::HashMap;
 
 use super::Point;
 
-/// A sparse model as read and checked: every number finite, every image's camera present, at least
-/// one image and one point.
+/// A sparse model, read and checked: all numbers are finite, every image's camera exists, and there
+/// is at least one image and one point.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct SparseModel {
     /// Cameras by id.
@@ -41,7 +41,8 @@ pub(super) struct SparseImage {
 impl SparseImage {
     /// World to camera, row-major 4x4, from the normalised quaternion and the translation.
     pub fn viewmat(&self) -> [[f64; 4]; 4] {
-        // By the largest component first, so that the squares neither vanish nor overflow.
+        // Divided by the largest component first, so that the squares neither underflow nor
+        // overflow.
         let largest = self.quaternion.iter().fold(0.0, |m: f64, q| m.max(q.abs()));
         let scaled = self.quaternion.map(|q| q / largest);
         let length = scaled.iter().map(|q| q * q).sum::<f64>().sqrt();

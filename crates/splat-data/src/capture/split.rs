@@ -1,4 +1,4 @@
-//! Which views are trained on and which are held out.
+//! The split into training and held-out views.
 
 use std::collections::{HashMap, HashSet};
 use std::path::Path;
@@ -6,19 +6,19 @@ use std::path::Path;
 use super::{CaptureError, CaptureWarning};
 use crate::text::without_mark;
 
-/// Every how many views one is held out where the capture does not say.
+/// Default interval of held-out views.
 const HOLD_OUT_EVERY: usize = 8;
 
-/// Indices into the views of a capture, each list ascending.
+/// Ascending indices into the views of a capture.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Split {
-    /// Views to train on.
+    /// Training views.
     pub train: Vec<usize>,
-    /// Views held out.
+    /// Held-out views.
     pub test: Vec<usize>,
 }
 
-/// `split.json`: two lists of photo names; anything else in it (such as a `rule`) is commentary.
+/// `split.json`: two lists of photo names. Other keys (such as `rule`) are comments.
 #[derive(serde::Deserialize)]
 struct SplitFile {
     train: Vec<String>,
@@ -26,13 +26,13 @@ struct SplitFile {
 }
 
 impl Split {
-    /// The usual split of `count` views sorted by name: every 8th from the first is held out.
+    /// The default split of `count` views sorted by name: every 8th from the first is held out.
     pub fn every_eighth(count: usize) -> Self {
         let (test, train) = (0..count).partition(|index| index % HOLD_OUT_EVERY == 0);
         Self { train, test }
     }
 
-    /// The split that `split.json` in `root` names, or the usual one where there is no such file.
+    /// The split named by `split.json` in `root`, or the default one if there is no such file.
     /// `names` are the photos' names, sorted.
     pub(super) fn of_capture(
         root: &Path,

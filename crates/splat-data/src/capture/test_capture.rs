@@ -1,5 +1,5 @@
-//! A small synthetic capture for the tests, written in COLMAP's binary or text encoding by code
-//! that knows nothing of the readers.
+//! A small synthetic capture for tests, written in COLMAP's binary or text encoding by code
+//! independent of the readers.
 
 use std::fmt::Write as _;
 use std::path::Path;
@@ -9,7 +9,7 @@ use super::Point;
 /// (id, quaternion, translation, camera id, name).
 type Image = (u32, [f64; 4], [f64; 3], u32, String);
 
-/// What to write; [`TestCapture::new`] gives a good one and the tests spoil it.
+/// The contents to write. [`TestCapture::new`] gives a valid capture, which tests then modify.
 pub(super) struct TestCapture {
     /// (id, model number, width, height, parameters).
     pub cameras: Vec<(u32, i32, u64, u64, Vec<f64>)>,
@@ -22,7 +22,7 @@ pub(super) struct TestCapture {
 pub(super) const SIZES: [[u32; 2]; 2] = [[32, 24], [24, 30]];
 
 impl TestCapture {
-    /// Nine images of two cameras (one of each model that can be read), ids and names out of order.
+    /// Nine images of two cameras (one of each supported model), with ids and names out of order.
     pub fn new() -> Self {
         let name = |i: u32| format!("view {}.png", char::from(b'z' - i as u8));
         Self {
@@ -33,7 +33,7 @@ impl TestCapture {
             images: (0..9)
                 .map(|i| {
                     let angle = f64::from(i) * 0.3;
-                    // Twice the unit length: readers normalise.
+                    // Twice unit length, as readers normalise.
                     let quaternion = [2.0 * angle.cos(), 0.0, 2.0 * angle.sin(), 0.0];
                     let camera = if i % 3 == 0 { 2 } else { 7 };
                     (

@@ -1,5 +1,5 @@
-//! What the readers promise: both encodings are one model, the geometry is kept, and bad input is
-//! an error that names the file, never a panic.
+//! Promises of the readers: both encodings give the same model, the geometry is preserved, and bad
+//! input is an error that names the file, never a panic.
 
 use std::path::{Path, PathBuf};
 
@@ -8,7 +8,7 @@ use tempfile::TempDir;
 use super::test_capture::{SIZES, TestCapture};
 use super::*;
 
-/// A good binary capture in a folder of its own.
+/// A valid binary capture in its own folder.
 fn good() -> (TempDir, TestCapture) {
     let root = TempDir::new().unwrap();
     let capture = TestCapture::new();
@@ -129,14 +129,14 @@ fn quaternions_are_normalised_and_poses_kept() {
             .find(|image| image.4 == view.name)
             .unwrap();
         assert_eq!([m[0][3], m[1][3], m[2][3]], *translation);
-        // The centre is what the camera maps to its origin.
+        // The centre is the point that the camera maps to its origin.
         let center = view.camera().position().to_array();
         for row in &m[..3] {
             let mapped = row[0] * center[0] + row[1] * center[1] + row[2] * center[2] + row[3];
             assert!(mapped.abs() < 1e-14);
         }
     }
-    // A turn about y by twice 0.3, as COLMAP's rotation matrix has it.
+    // A rotation about y by twice 0.3, in COLMAP's convention.
     let second = views.iter().find(|view| view.name == "view y.png").unwrap();
     assert!((second.viewmat[0][2] - 0.6f64.sin()).abs() < 1e-15);
     assert!((second.viewmat[2][0] + 0.6f64.sin()).abs() < 1e-15);
@@ -202,7 +202,7 @@ fn a_named_split_is_followed() {
     std::fs::write(&path, "[]").unwrap();
     error_of(root.path(), "split.json");
 
-    // As editors on Windows leave it.
+    // As saved by editors on Windows.
     let marked = format!("\u{feff}{}", json.replace(", ", ",\r\n"));
     std::fs::write(&path, marked).unwrap();
     assert_eq!(load(root.path()).unwrap().split, capture.split);
@@ -241,7 +241,7 @@ fn downscale_averages_areas_and_divides_intrinsics() {
         }
     }
 
-    // What does not fill a block is dropped: 7 x 5 by 3 is 2 x 1.
+    // Pixels that do not fill a block are dropped: 7 x 5 by 3 is 2 x 1.
     let image: Vec<u8> = (0..7 * 5).flat_map(|i| [i, 0, 255]).collect();
     let (pixels, w, h) = downscale::area_average(&image, 7, 5, 3);
     assert_eq!((w, h), (2, 1));
@@ -282,7 +282,7 @@ fn rescaled_photos_take_their_intrinsics_along() {
     };
     assert!(warning.to_string().contains(name));
 
-    // Another shape is no rescale.
+    // A different aspect ratio is not a rescale.
     for (w, h, word) in [(22, 22, "uniform"), (24, 32, "rotated"), (1, 1, "11x11")] {
         image::RgbImage::new(w, h).save(&path).unwrap();
         assert!(error_of(root.path(), name).to_string().contains(word));
@@ -448,7 +448,7 @@ fn other_camera_models_are_named() {
     assert!(message.contains("camera 2") && message.contains("OPENCV"));
 }
 
-/// Spoils one thing in the good model and returns the message of the error, which must name `file`.
+/// Breaks one thing in the valid model and returns the error message, which must name `file`.
 fn message_after(file: &str, spoil: impl FnOnce(&mut TestCapture)) -> String {
     let (root, mut model) = good();
     spoil(&mut model);
@@ -554,13 +554,13 @@ fn one_photo_can_be_looked_at_but_not_trained_on() {
     let message = capture.check_trainable().unwrap_err().to_string();
     assert!(message.contains("at least 2"), "{message}");
 
-    // Unless the capture says that it is to be trained on.
+    // Unless the capture assigns it to training.
     let split = format!(r#"{{"train": ["{}"], "test": []}}"#, model.images[0].4);
     std::fs::write(root.path().join("split.json"), split).unwrap();
     load(root.path()).unwrap().check_trainable().unwrap();
 }
 
-/// A photo is read from the folder of photos, wherever the model says that it lies.
+/// Photos are read from the folder of photos, even if the model gives another path.
 #[test]
 fn a_name_that_leads_out_of_the_folder_is_refused() {
     for name in [
@@ -574,7 +574,7 @@ fn a_name_that_leads_out_of_the_folder_is_refused() {
         assert!(message.contains("image 97"), "{message}");
         assert!(message.contains("leads out of the folder"), "{message}");
     }
-    // Dots in a name are only dots.
+    // Dots in a name are literal.
     let (root, mut model) = good();
     model.images[3].4 = "a..b...png".into();
     model.write_photos(root.path());
@@ -582,7 +582,7 @@ fn a_name_that_leads_out_of_the_folder_is_refused() {
     assert_eq!(load(root.path()).unwrap().views[0].name, "a..b...png");
 }
 
-/// The second one took the place of the first.
+/// The second entry replaced the first.
 #[test]
 fn two_cameras_of_one_id_are_refused() {
     let message = message_after("cameras.bin", |model| model.cameras[1].0 = 7);
@@ -592,7 +592,7 @@ fn two_cameras_of_one_id_are_refused() {
     );
 }
 
-/// Squares of such components vanish or overflow, in part or all of them.
+/// Squares of such components underflow or overflow, some or all of them.
 #[test]
 fn quaternions_of_any_length_are_normalised() {
     let viewmat = |length: f64| {

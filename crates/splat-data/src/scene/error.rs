@@ -1,4 +1,4 @@
-//! What can be wrong with a scene file.
+//! Errors of scene files.
 
 use std::path::PathBuf;
 
@@ -12,7 +12,7 @@ pub enum SceneFileError {
     Io {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The header is not that of a PLY file of splats.
@@ -20,10 +20,10 @@ pub enum SceneFileError {
     Header {
         /// The file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// The reason.
         reason: String,
     },
-    /// A property that a splat needs is not in the header.
+    /// A required property is missing from the header.
     #[error("{}: vertices lack the property `{property}`; this is no PLY file in the 3DGS layout", path.display())]
     MissingProperty {
         /// The file.
@@ -31,7 +31,7 @@ pub enum SceneFileError {
         /// Name of the property.
         property: String,
     },
-    /// The number of `f_rest_*` properties belongs to no degree of spherical harmonics.
+    /// The number of `f_rest_*` properties matches no degree of spherical harmonics.
     #[error(
         "{}: {count} properties f_rest_*; spherical harmonics of degree 0, 1, 2, 3 have 0, 9, 24, 45",
         path.display()
@@ -39,7 +39,7 @@ pub enum SceneFileError {
     RestCount {
         /// The file.
         path: PathBuf,
-        /// How many there are.
+        /// Number of `f_rest_*` properties.
         count: usize,
     },
     /// The file holds no Gaussian.
@@ -55,21 +55,21 @@ pub enum SceneFileError {
         path: PathBuf,
         /// The Gaussian being read.
         index: usize,
-        /// How many the header announces.
+        /// Number of Gaussians in the header.
         count: usize,
     },
-    /// A line of an ASCII file that cannot be read.
+    /// A line of an ASCII file cannot be read.
     #[error("{}: Gaussian {index}: {reason}", path.display())]
     BadElement {
         /// The file.
         path: PathBuf,
         /// The Gaussian.
         index: usize,
-        /// What is wrong with it.
+        /// The reason.
         reason: String,
     },
-    /// A value that is NaN, or infinite where that means nothing: opacity logits may be infinite,
-    /// log-scales minus infinite.
+    /// A value is NaN, or infinite where infinity is meaningless: opacity logits may be infinite,
+    /// and log-scales minus infinity.
     #[error("{}: Gaussian {index}: {property} is {value}", path.display())]
     NotFinite {
         /// The file.
@@ -81,26 +81,26 @@ pub enum SceneFileError {
         /// The value.
         value: f32,
     },
-    /// A setting of the scene that no reader would take.
+    /// A scene setting that no reader would accept.
     #[error("{}: {setting} is {value}; it must be {must_be}", path.display())]
     Setting {
         /// The file.
         path: PathBuf,
-        /// Name of the setting, as [`SceneSettings`](super::SceneSettings) has it.
+        /// Name of the setting in [`SceneSettings`](super::SceneSettings).
         setting: &'static str,
         /// The value.
         value: String,
-        /// What would do.
+        /// The allowed values.
         must_be: &'static str,
     },
-    /// Arrays of a scene that do not fit each other.
+    /// Arrays of a scene have inconsistent lengths.
     #[error("scene: {field} has {len} entries instead of {expected}")]
     Shape {
         /// Name of the array.
         field: &'static str,
         /// Its length.
         len: usize,
-        /// The length that fits.
+        /// The expected length.
         expected: usize,
     },
 }

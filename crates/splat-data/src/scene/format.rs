@@ -1,4 +1,4 @@
-//! What a format of scene files is.
+//! The interface of a scene file format.
 
 use std::path::Path;
 
@@ -6,15 +6,14 @@ use super::{SceneFileError, SplatData};
 
 /// A format of scene files.
 pub struct SceneFormat {
-    /// What people call it.
+    /// Display name.
     pub name: &'static str,
-    /// Endings of its files, without the dot, in lower case.
+    /// File extensions, without the dot, in lower case.
     pub endings: &'static [&'static str],
-    /// Whether a file begins as one in this format does, given its first 64 bytes or all of a
-    /// shorter one.
+    /// True if a file is in this format, judged by its first 64 bytes (or all of a shorter file).
     pub is: fn(&[u8]) -> bool,
     /// Reads a file.
     pub read: fn(&Path) -> Result<SplatData, SceneFileError>,
-    /// Writes a file, whole or not at all.
+    /// Writes a file atomically.
     pub write: fn(&Path, &SplatData) -> Result<(), SceneFileError>,
 }

@@ -1,4 +1,4 @@
-//! The formats of scene files, and which of them a file is in.
+//! The scene file formats, and detection of a file's format.
 
 use std::fs::File;
 use std::io::Read;
@@ -7,21 +7,21 @@ use std::path::Path;
 use super::format::SceneFormat;
 use super::{SceneFileError, SplatData, ply};
 
-/// Every format.
+/// All formats.
 pub const FORMATS: &[SceneFormat] = &[ply::FORMAT];
 
-/// Bytes from which a format is known.
+/// Number of bytes used to recognise a format.
 const HEAD: u64 = 64;
 
-/// Reads a scene in any format: the one that the file's first bytes are of, or else that of its
-/// name, or else the first.
+/// Reads a scene in any format, recognised by the file's first bytes, else by its extension, else
+/// the first format.
 ///
 /// # Errors
-/// When the file cannot be read or is not in the format, see [`SceneFileError`].
+/// [`SceneFileError`] if the file cannot be read or is malformed.
 pub fn read(path: impl AsRef<Path>) -> Result<SplatData, SceneFileError> {
     let path = path.as_ref();
     let mut head = Vec::new();
-    // A pipe gives its bytes once; whatever else cannot be read says so when it is read in earnest.
+    // A pipe yields its bytes only once; other unreadable files are reported by the reader.
     if path.is_file()
         && let Ok(file) = File::open(path)
     {
@@ -32,10 +32,10 @@ pub fn read(path: impl AsRef<Path>) -> Result<SplatData, SceneFileError> {
     (format.read)(path)
 }
 
-/// Writes a scene in the format of the file's name; PLY where the name has no ending.
+/// Writes a scene in the format of the file's extension; PLY without an extension.
 ///
 /// # Errors
-/// When no format has files of that name, or the scene cannot be written, see [`SceneFileError`].
+/// [`SceneFileError`] if the extension is unknown or the scene cannot be written.
 pub fn write(path: impl AsRef<Path>, scene: &SplatData) -> Result<(), SceneFileError> {
     let path = path.as_ref();
     let format = match (of_name(path), path.extension()) {

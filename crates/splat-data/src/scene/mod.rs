@@ -33,12 +33,12 @@ pub use formats::{FORMATS, read, write};
 
 use crate::SceneScale;
 
-/// A scene as files hold it: plain arrays, one entry per Gaussian, in the parametrisation that is
-/// trained.
+/// A scene as stored in files: plain arrays, one entry per Gaussian, in the trained
+/// parametrisation.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SplatData {
-    /// Where in the world the means count from: 0 unless the scene lies far from the world's zero,
-    /// as in map coordinates, where 32-bit floats would round its details away.
+    /// Origin of the means in the world. Zero unless the scene is far from the world's zero, as in
+    /// map coordinates, where 32-bit floats would lose detail.
     pub origin: [f64; 3],
     /// Centres relative to `origin`, `[N][3]`, world units.
     pub means: Vec<[f32; 3]>,
@@ -55,27 +55,27 @@ pub struct SplatData {
     pub sh_rest: Vec<f32>,
     /// Degree of the spherical harmonics, 0 to 3.
     pub sh_degree: usize,
-    /// How it must be rendered, as far as that is known.
+    /// Render settings, as far as they are known.
     pub settings: SceneSettings,
 }
 
-/// Settings that a scene must be rendered with to look as it did when it was trained. They are part
-/// of the scene, and of its file: `None` where the file does not say.
+/// Settings that reproduce a scene's look at training. They are part of the scene and of its file;
+/// `None` if the file does not say.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct SceneSettings {
-    /// Size of the scene in world units, which lengths of the renderer count in; positive.
+    /// Size of the scene in world units, the unit of the renderer's lengths; positive.
     pub scene_scale: Option<f64>,
-    /// Whether opacities are multiplied by what the low-pass filter took away.
+    /// True if opacities are multiplied by the compensation of the low-pass filter.
     pub antialias: Option<bool>,
     /// Colour behind the scene, linear RGB; black is zero.
     pub background: Option<[f32; 3]>,
-    /// What the file says about rendering that this program cannot follow, each in a line; for a
+    /// Render settings in the file that this program does not support, one line each; for a
     /// warning, and not written.
     pub not_understood: Vec<String>,
 }
 
 impl SplatData {
-    /// Size of the scene: as its settings say, or else as its Gaussians are spread.
+    /// Size of the scene: from its settings, or else from the spread of its Gaussians.
     pub fn scene_scale(&self) -> SceneScale {
         let said = self.settings.scene_scale.and_then(SceneScale::new);
         said.unwrap_or_else(|| SceneScale::of_splats(self))
@@ -86,7 +86,7 @@ impl SplatData {
         self.means.len()
     }
 
-    /// True when there is no Gaussian.
+    /// True if there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.means.is_empty()
     }

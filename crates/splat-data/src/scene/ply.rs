@@ -1,22 +1,21 @@
-//! PLY in the layout of the 3DGS paper's code, the one that viewers read.
+//! PLY in the layout of the 3DGS paper's code, which viewers read.
 //!
-//! One element `vertex` per Gaussian with the properties, all `float`,
+//! One element `vertex` per Gaussian with these properties, all `float`:
 //!
 //! ```text
 //! x y z  nx ny nz  f_dc_0..2  f_rest_0..(3 (K - 1) - 1)  opacity  scale_0..2  rot_0..3
 //! ```
 //!
-//! where K = (degree + 1)^2, opacity is the logit, scale the natural logarithm, rot the quaternion
-//! (w, x, y, z), and `f_rest_*` runs over the coefficients of red, then of green, then of blue
-//! (channel-major; in [`SplatData`] it is coefficient-major). The normals are written as 0 and not
-//! read.
+//! Here K = (degree + 1)^2, opacity is the logit, scale the natural logarithm, rot the quaternion
+//! (w, x, y, z), and `f_rest_*` holds the coefficients of red, then green, then blue
+//! (channel-major; [`SplatData`] is coefficient-major). The normals are written as 0 and not read.
 //!
-//! Comments of the header hold the origin and how to render the scene ([`SplatData::settings`]):
-//! `ply/comments.rs` has their form. Other programs see a scene without the offset of its origin.
+//! Comments of the header hold the origin and the render settings ([`SplatData::settings`]), in the
+//! form of `ply/comments.rs`. Other programs see the scene without the offset of its origin.
 //!
-//! [`write()`] writes binary little endian. [`read()`] also takes ASCII and big endian, properties
-//! in any order and of any number type (such as `double`), ignores properties and elements it does
-//! not know, and is generous with the header: `ply/header.rs` has how.
+//! [`write()`] writes binary little endian. [`read()`] also accepts ASCII and big endian,
+//! properties in any order and of any number type (such as `double`), ignores unknown properties
+//! and elements, and tolerates variations of the header listed in `ply/header.rs`.
 
 mod columns;
 mod comments;
@@ -38,7 +37,7 @@ use ply_rs_bw::writer::Writer;
 use super::{SceneFileError, SceneFormat, SplatData};
 use columns::{Columns, may_be};
 
-/// PLY files of splats.
+/// PLY files with splats.
 pub(super) const FORMAT: SceneFormat = SceneFormat {
     name: "PLY",
     endings: &["ply"],
@@ -47,15 +46,15 @@ pub(super) const FORMAT: SceneFormat = SceneFormat {
     write: |path, scene| write(path, scene),
 };
 
-/// Writes `scene` to `path`, whole or not at all: beside it first, then renamed. The disk has the
-/// new file before it loses the old one, so that a crash of the machine leaves one of them.
+/// Writes `scene` to `path` atomically: to a temporary file beside it, which is then renamed. The
+/// new file reaches the disk before the old one is removed, so that one of them survives a machine
+/// crash.
 ///
 /// # Errors
 ///
-/// [`SceneFileError::Shape`] where the arrays of the scene do not fit each other,
-/// [`SceneFileError::NotFinite`] and [`SceneFileError::Setting`] where a value means nothing and no
-/// reader would take it (NaN, or infinite where that means nothing), [`SceneFileError::Io`] where
-/// the file cannot be written.
+/// [`SceneFileError::Shape`] if the arrays of the scene are inconsistent,
+/// [`SceneFileError::NotFinite`] and [`SceneFileError::Setting`] for values that no reader would
+/// accept (NaN, or meaningless infinities), [`SceneFileError::Io`] if the file cannot be written.
 pub fn write(path: impl AsRef<Path>, scene: &SplatData) -> Result<(), SceneFileError> {
     let path = path.as_ref();
     scene.check_shape()?;
@@ -64,7 +63,7 @@ pub fn write(path: impl AsRef<Path>, scene: &SplatData) -> Result<(), SceneFileE
         path: path.to_path_buf(),
         source,
     };
-    // The file that a link points to, not the link.
+    // The target of a link, not the link itself.
     let target = path
         .is_symlink()
         .then(|| path.canonicalize().ok())
@@ -123,7 +122,7 @@ pub fn write(path: impl AsRef<Path>, scene: &SplatData) -> Result<(), SceneFileE
 ///
 /// # Errors
 ///
-/// [`SceneFileError`], naming the file and, where there is one, the property and the Gaussian.
+/// [`SceneFileError`], naming the file and, if applicable, the property and the Gaussian.
 pub fn read(path: impl AsRef<Path>) -> Result<SplatData, SceneFileError> {
     let path = path.as_ref();
     let io_error = |source| SceneFileError::Io {
@@ -135,7 +134,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<SplatData, SceneFileError> {
     read_from(path, BufReader::with_capacity(1 << 20, file), bytes)
 }
 
-/// [`read()`] on the content of a file; `path` is for messages.
+/// [`read()`] from the contents of a file; `path` is used in messages.
 ///
 /// # Errors
 ///
@@ -167,7 +166,7 @@ fn read_from(
             rows.skip(&mut reader)?;
             continue;
         }
-        // A damaged count must not become a huge allocation: every property takes at least a byte.
+        // A damaged count must not cause a huge allocation: every property takes at least one byte.
         let most = bytes / element.properties.len().max(1) as u64;
         let mut scene = columns.empty_scene(element.count.min(most as usize));
         (scene.origin, scene.settings) = comments::read(path, &header.comments)?;
@@ -184,13 +183,13 @@ fn read_from(
         }
         return Ok(scene);
     }
-    // `Columns::find` has made sure that there is an element `vertex`.
+    // `Columns::find` has checked that there is an element `vertex`.
     Err(SceneFileError::Empty {
         path: path.to_path_buf(),
     })
 }
 
-/// Names of the properties in the order they are written, for a scene of `rest` values `f_rest_*`.
+/// Property names in the order in which they are written, for `rest` values `f_rest_*`.
 fn property_names(rest: usize) -> Vec<String> {
     let numbered = |stem: &'static str, count| (0..count).map(move |i| format!("{stem}_{i}"));
     ["x", "y", "z", "nx", "ny", "nz"]
@@ -206,12 +205,11 @@ fn property_names(rest: usize) -> Vec<String> {
 
 /// The values of one element in the order of the header.
 ///
-/// The PLY library hands values over and asks for them by name, once each and in the order of the
-/// header; keeping the order and not looking at the names makes a million Gaussians of 62
-/// properties cheap.
+/// The PLY library passes values by name, each once and in the order of the header. Relying on the
+/// order instead of comparing names makes a million Gaussians of 62 properties cheap.
 struct Row {
     values: Vec<f32>,
-    /// Next value to be written.
+    /// Next value to write.
     next: Cell<usize>,
 }
 
@@ -244,8 +242,8 @@ impl PropertyAccess for Row {
     }
 
     fn set_property(&mut self, _name: &str, property: Property) -> PropertyAccessResult {
-        // A list keeps its place in the order; `Columns::find` refuses lists where a number is
-        // needed.
+        // A list keeps its position in the order; `Columns::find` refuses lists where a number is
+        // required.
         self.values
             .push(property.to_f32_lossy().unwrap_or(f32::NAN));
         PropertyAccessResult::Set
@@ -272,9 +270,9 @@ struct Rows<'a> {
 }
 
 impl Rows<'_> {
-    /// Passes over all of them.
+    /// Skips all of them.
     fn skip(&mut self, reader: &mut impl BufRead) -> Result<(), SceneFileError> {
-        // Of an element without properties a binary file holds nothing, however many the header
+        // A binary file stores nothing for an element without properties, whatever count the header
         // announces.
         let nothing = self.element.properties.is_empty() && self.encoding != Encoding::Ascii;
         for index in 0..if nothing { 0 } else { self.element.count } {
@@ -315,8 +313,8 @@ impl Rows<'_> {
             .map_err(|(property, reason)| self.bad(index, &format!("{property} {reason}")))
     }
 
-    /// The line's values, or a property and what is wrong with it. The library's own grammar of
-    /// lines knows neither NaN nor infinity, and it is worth naming the property that has them.
+    /// The values of the line, or a property and its problem. The library's own line grammar has no
+    /// NaN or infinity, and errors should name the property.
     fn parse_line(&self) -> Result<Row, (&str, String)> {
         let mut words = self.line.split_whitespace();
         let mut row = Row::new();
@@ -371,12 +369,12 @@ impl Rows<'_> {
     }
 }
 
-/// The library's messages span lines; ours do not.
+/// The library's messages span several lines; ours do not.
 fn one_line(message: &str) -> String {
     message.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
-/// The error without the random name of the temporary file, which says nothing to anybody.
+/// The error without the random name of the temporary file, which means nothing to the user.
 fn without_temporary_name(error: std::io::Error) -> std::io::Error {
     let text = error.to_string();
     match text.split_once(" at path \"") {
@@ -389,7 +387,7 @@ fn without_temporary_name(error: std::io::Error) -> std::io::Error {
 #[cfg(unix)]
 fn readable_by_all(builder: &mut tempfile::Builder<'_, '_>) {
     use std::os::unix::fs::PermissionsExt;
-    // The process's umask still applies.
+    // The umask of the process still applies.
     builder.permissions(std::fs::Permissions::from_mode(0o666));
 }
 

@@ -1,10 +1,10 @@
-//! What the text readers promise: each line is taken for what it is, however a program or an editor
-//! left it.
+//! Promises of the text readers: each line is classified correctly, whichever program or editor
+//! wrote it.
 
 use super::*;
 
 const PATH: &str = "images.txt";
-/// Names that are hard to tell from keypoints, and one in a sub-folder.
+/// Names that are hard to tell from keypoints, and one in a subfolder.
 const NAMES: [&str; 5] = [
     "0001.png",
     "cam 1/a b.png",
@@ -13,7 +13,7 @@ const NAMES: [&str; 5] = [
     "cam1/0001.png",
 ];
 const KEYPOINTS: &str = "1.5 2.5 -1 3.0 4.0 12";
-/// Keypoints that begin as an image does: whole numbers, a small id in the ninth place, and more.
+/// Keypoints that begin like an image: whole numbers, a small id in the ninth position, and more.
 const LIKE_AN_IMAGE: &str = "10 20 -1 30 40 -1 50 60 7 70 80 12";
 
 fn record(index: usize) -> String {
@@ -21,7 +21,7 @@ fn record(index: usize) -> String {
     format!("{id} 0.8 0 0.6 0 1.5 -2 0.25 7 {name}")
 }
 
-/// The file with the lines that `after` puts behind each image.
+/// The file, with the lines that `after` adds after each image.
 fn file(after: impl Fn(usize) -> &'static str) -> String {
     let lines = (0..NAMES.len()).map(|index| record(index) + "\n" + after(index));
     let head = "# Image list with two lines of data per image:\n# Number of images: 5, mean observations per image: 1.5\n";
@@ -86,7 +86,7 @@ fn images_are_found_whatever_follows_them() {
 
 #[test]
 fn what_could_be_either_is_what_its_place_says() {
-    // Behind an image, keypoints; elsewhere an image.
+    // Keypoints after an image; an image elsewhere.
     assert_eq!(images(record(0) + "\n" + LIKE_AN_IMAGE).len(), 1);
     let numbered = "3 1 0 0 0 5 5 5 7 10 11 12";
     for text in [
@@ -96,7 +96,7 @@ fn what_could_be_either_is_what_its_place_says() {
     ] {
         assert_eq!(images(&text).last().unwrap().name, "10 11 12", "{text}");
     }
-    // No keypoint has a broken number for its id, so this is an image everywhere.
+    // Keypoints have no fractional id, so this is an image everywhere.
     let numbered = "3 1 0.5 0 0 5 5 5 7 10 11 12";
     assert_eq!(images(record(0) + "\n" + numbered).len(), 2);
 }
@@ -135,7 +135,7 @@ fn what_is_neither_is_named() {
             assert!(message.contains(word), "`{message}` does not say `{word}`");
         }
     }
-    // Somebody's line is shown in part, and what cannot be seen is spelled out.
+    // The message shows part of the user's line and spells out invisible characters.
     let message = error(format!("\u{feff}\u{feff}{first}"));
     assert!(message.contains("u{feff}"), "{message}");
     assert!(error("x".repeat(100_000)).len() < 300);
@@ -148,7 +148,7 @@ fn encodings_are_named() {
     assert!(error(&utf16).contains("UTF-16"));
     assert!(error([&[0xff, 0xfe], &utf16[..]].concat()).contains("UTF-16"));
 
-    // A comment may be in any encoding, a name not: no file is found by it.
+    // Comments may be in any encoding; names may not, as they would match no file.
     let latin = [b"# caf\xe9\n", text.as_bytes()].concat();
     assert_eq!(images(&latin).len(), 1);
     let latin = b"# hi\n1 1 0 0 0 0 0 0 7 le caf\xe9.png\n";
@@ -170,7 +170,7 @@ fn records_end_where_they_should() {
     let head = "# Camera list\n# Number of cameras: 3\n";
     let listed = cameras(&format!("\u{feff}{head}7 PINHOLE 32 24 40 41 15 12\r\n")).unwrap();
     assert_eq!((listed.records.len(), listed.announced), (1, Some(3)));
-    // A pinhole camera with one more parameter has another model.
+    // A pinhole camera with an extra parameter has another model.
     let message = cameras("7 PINHOLE 32 24 40 41 15 12 0.1")
         .unwrap_err()
         .to_string();

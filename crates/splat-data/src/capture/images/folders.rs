@@ -1,4 +1,4 @@
-//! Where the photos of a capture lie.
+//! Location of a capture's photos.
 
 use std::collections::{BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
@@ -6,14 +6,13 @@ use std::path::{Path, PathBuf};
 use super::super::sparse_model::SparseModel;
 use super::super::{CaptureError, CaptureWarning};
 
-/// Endings of the files that are photos: what structure from motion reads, not only what is read
-/// here.
+/// Extensions of photos: those that structure from motion reads, not only the supported ones.
 const PHOTO_ENDINGS: [&str; 9] = [
     "jpg", "jpeg", "jpe", "png", "tif", "tiff", "bmp", "webp", "heic",
 ];
 
-/// The folder `given`, in the capture `root` or absolute; without one `images/`, or the capture
-/// itself if there is none.
+/// The folder `given`, relative to the capture `root` or absolute; by default `images/`, or the
+/// capture itself if that does not exist.
 pub(super) fn of_photos(
     root: &Path,
     given: Option<&Path>,
@@ -34,8 +33,8 @@ pub(super) fn of_photos(
     })
 }
 
-/// The folder of the capture, relative to it, that holds most photos of the model, and how many;
-/// nothing if that is `used`, which does not hold all.
+/// The folder of the capture, relative to it, that holds the most photos of the model, with their
+/// number; `None` if that is `used`, which does not hold all.
 pub(super) fn elsewhere(root: &Path, used: &Path, model: &SparseModel) -> Option<(PathBuf, usize)> {
     let held = |folder: &Path| {
         let there = |name: &str| folder.join(name).is_file();
@@ -62,9 +61,9 @@ pub(super) fn elsewhere(root: &Path, used: &Path, model: &SparseModel) -> Option
     most
 }
 
-/// Photos that the model does not name, in the folders where its photos lie. If those are in
-/// sub-folders (`cam1/0001.png`), all sub-folders are searched, for a whole camera may be missing;
-/// otherwise none is: masks or smaller copies lie there.
+/// Photos that the model does not name, in the folders of its photos. If those are subfolders
+/// (`cam1/0001.png`), all subfolders are searched, as a whole camera may be missing. Otherwise
+/// subfolders are ignored, as they contain masks or smaller copies.
 pub(super) fn unregistered(
     root: &Path,
     folder: &Path,
@@ -100,7 +99,7 @@ pub(super) fn unregistered(
     })
 }
 
-/// Adds `folder` and every folder below it, links aside.
+/// Adds `folder` and all folders below it, without following links.
 fn add_below(folder: &Path, folders: &mut BTreeSet<PathBuf>) {
     folders.insert(folder.to_path_buf());
     for below in sub_folders(folder, |path| path.is_dir() && !path.is_symlink()) {
@@ -108,7 +107,7 @@ fn add_below(folder: &Path, folders: &mut BTreeSet<PathBuf>) {
     }
 }
 
-/// Sub-folders by name, without hidden ones.
+/// Subfolders by name, without hidden ones.
 fn sub_folders(folder: &Path, is_folder: fn(&Path) -> bool) -> Vec<PathBuf> {
     let Ok(entries) = std::fs::read_dir(folder) else {
         return Vec::new();
@@ -121,7 +120,7 @@ fn sub_folders(folder: &Path, is_folder: fn(&Path) -> bool) -> Vec<PathBuf> {
     folders
 }
 
-/// Thumbnails and notes of systems: `.thumbnails`, `._0001.jpg`, `@eaDir`.
+/// System thumbnails and notes: `.thumbnails`, `._0001.jpg`, `@eaDir`.
 fn is_hidden(path: &Path) -> bool {
     let name = path.file_name().unwrap_or_default().as_encoded_bytes();
     matches!(name.first(), None | Some(b'.' | b'@'))

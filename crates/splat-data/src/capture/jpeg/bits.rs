@@ -3,18 +3,18 @@
 /// Why coded data cannot be followed to the end of a picture.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Broken {
-    /// The file ends, or a marker comes, where more data must be.
+    /// The file ends, or a marker follows, where more data is required.
     Early,
     /// Bits that no encoder writes.
     Corrupt,
 }
 
-/// A Huffman table (ITU T.81, annex C): the code that the next 16 bits begin with, as length * 256
-/// + symbol; 0 where there is none.
+/// A Huffman table (ITU T.81, annex C), indexed by the next 16 bits: length * 256 + symbol; 0 if
+/// they begin with no code.
 pub(super) struct Huffman(Vec<u16>);
 
 impl Huffman {
-    /// The table with `counts[i]` codes of `i + 1` bits, or nothing where there are more codes than
+    /// The table with `counts[i]` codes of `i + 1` bits, or `None` if there are more codes than
     /// fit.
     pub fn new(counts: &[u8; 16], symbols: &[u8]) -> Option<Self> {
         let mut lookup = vec![0; 1 << 16];
@@ -33,18 +33,18 @@ impl Huffman {
     }
 }
 
-/// A cursor over a file: byte by byte between scans, bit by bit inside them.
+/// A cursor over a file: by bytes between scans, by bits inside them.
 pub(super) struct Bits<'a> {
     bytes: &'a [u8],
-    /// The first byte that is not in `buffer`.
+    /// First byte that is not in `buffer`.
     at: usize,
-    /// Bits that are read but not taken, the next one on top; 0 below them.
+    /// Bits read but not yet consumed, the next one on top; zeros below.
     buffer: u64,
     held: u32,
 }
 
 impl<'a> Bits<'a> {
-    /// Begins at byte `at`.
+    /// Starts at byte `at`.
     pub fn new(bytes: &'a [u8], at: usize) -> Self {
         Self {
             bytes,
@@ -54,7 +54,7 @@ impl<'a> Bits<'a> {
         }
     }
 
-    /// The code of the next marker, whatever lies before it; nothing at the end of the file.
+    /// Code of the next marker, skipping anything before it; `None` at the end of the file.
     pub fn marker(&mut self) -> Option<u8> {
         loop {
             let rest = self.bytes.get(self.at..)?;
@@ -72,7 +72,7 @@ impl<'a> Bits<'a> {
         }
     }
 
-    /// What belongs to the marker just read; nothing if the file ends before it does.
+    /// Contents of the segment after the marker just read; `None` if the file ends first.
     pub fn segment(&mut self) -> Option<&'a [u8]> {
         let rest = self.bytes.get(self.at..)?;
         let (length, _) = rest.split_first_chunk()?;
@@ -82,18 +82,18 @@ impl<'a> Bits<'a> {
         Some(segment)
     }
 
-    /// The place of the next byte.
+    /// Position of the next byte.
     #[cfg(test)]
     pub fn at(&self) -> usize {
         self.at
     }
 
-    /// Number of bytes of the whole file.
+    /// Number of bytes in the whole file.
     pub fn file_len(&self) -> usize {
         self.bytes.len()
     }
 
-    /// Takes `count` bits, at most 16.
+    /// Reads `count` bits, at most 16.
     pub fn take(&mut self, count: u32) -> Result<u32, Broken> {
         if count == 0 {
             return Ok(0);
@@ -106,7 +106,7 @@ impl<'a> Bits<'a> {
         Ok(value)
     }
 
-    /// Takes one symbol.
+    /// Reads one symbol.
     pub fn symbol(&mut self, table: &Huffman) -> Result<u8, Broken> {
         if self.held < 16 {
             self.fill();
@@ -124,7 +124,7 @@ impl<'a> Bits<'a> {
         Ok(code as u8)
     }
 
-    /// Ends a run of coded data; whether more was left of it than the bits that fill its last byte.
+    /// Ends a run of coded data; returns true if more was left than the padding of the last byte.
     pub fn end(&mut self) -> bool {
         self.fill();
         let left_over = self.held >= 8;
@@ -141,7 +141,7 @@ impl<'a> Bits<'a> {
         Ok(())
     }
 
-    /// Reads bytes until the buffer is full, or a marker or the end of the file comes.
+    /// Reads bytes until the buffer is full or a marker or the end of the file follows.
     fn fill(&mut self) {
         while self.held <= 56 {
             let Some(&byte) = self.bytes.get(self.at) else {

@@ -1,8 +1,8 @@
-//! One scan of a JPEG file: its blocks, one after the other, without their values.
+//! One scan of a JPEG file: walks its blocks without decoding their values.
 
 use super::bits::{Bits, Broken, Huffman};
 
-/// Coefficients of a block.
+/// Coefficients per block.
 pub(super) const BLOCK: usize = 64;
 /// A coefficient that no scan has sent.
 pub(super) const UNSENT: u8 = u8::MAX;
@@ -10,7 +10,7 @@ pub(super) const UNSENT: u8 = u8::MAX;
 /// The picture: its size in blocks, and how much of it was sent.
 pub(super) struct Frame {
     pub progressive: bool,
-    /// Whole MCUs (blocks that are sent together) of a row, and rows of them.
+    /// MCUs (blocks that are sent together) per row, and rows of them.
     pub across: usize,
     pub down: usize,
     pub components: Vec<Component>,
@@ -19,20 +19,20 @@ pub(super) struct Frame {
 /// A colour component of the picture.
 pub(super) struct Component {
     pub id: u8,
-    /// Blocks of an MCU.
+    /// Blocks per MCU.
     pub horizontal: usize,
     pub vertical: usize,
-    /// Blocks of a row, and rows of them, without those that only fill an MCU.
+    /// Blocks per row and number of rows, without MCU padding.
     pub across: usize,
     pub down: usize,
     /// Lowest bit of every coefficient that was sent.
     pub sent: [u8; BLOCK],
-    /// Which coefficients of every block are not 0, in zigzag order from bit 0; progressive
-    /// pictures only, whose later scans depend on it. Blocks that fill an MCU have their place too.
+    /// Non-zero coefficients of every block, in zigzag order from bit 0. Only for progressive
+    /// pictures, whose later scans depend on them. Padding blocks are included.
     pub nonzero: Vec<u64>,
 }
 
-/// A component's part in a scan.
+/// A component's role in a scan.
 pub(super) struct Member<'a> {
     /// Index of the component.
     pub component: usize,
@@ -40,15 +40,15 @@ pub(super) struct Member<'a> {
     pub ac: Option<&'a Huffman>,
 }
 
-/// What a scan sends: coefficients `first..=last` down to the bit `low`, `high` being the lowest
-/// bit sent before, or 0.
+/// Contents of a scan: coefficients `first..=last` down to the bit `low`; `high` is the lowest bit
+/// sent before, or 0.
 pub(super) struct Scan<'a> {
     pub members: Vec<Member<'a>>,
     pub first: usize,
     pub last: usize,
     pub high: u8,
     pub low: u8,
-    /// MCUs between two restart markers; 0 without.
+    /// MCUs between restart markers; 0 for none.
     pub restart: usize,
 }
 
@@ -60,7 +60,7 @@ pub(super) struct Unfinished {
 }
 
 impl Scan<'_> {
-    /// Walks all blocks of the scan; whether coded data was left over.
+    /// Walks all blocks of the scan; returns true if coded data was left over.
     pub fn walk(&self, frame: &mut Frame, bits: &mut Bits<'_>) -> Result<bool, Unfinished> {
         let single = self.members.len() == 1;
         let (across, down) = match &self.members[..] {
@@ -109,11 +109,11 @@ impl Scan<'_> {
     }
 }
 
-/// What goes on from block to block.
+/// State carried from block to block.
 struct Walk<'a> {
     scan: &'a Scan<'a>,
     progressive: bool,
-    /// Blocks to come that send nothing new (the run of an EOBn symbol).
+    /// Remaining blocks that send nothing new (the run of an EOBn symbol).
     skipped: u32,
 }
 
@@ -170,8 +170,8 @@ impl Walk<'_> {
         Ok(())
     }
 
-    /// One more bit of coefficients (T.81, G.1.2.3): of each that is not 0 already, and the sign of
-    /// each that becomes so.
+    /// One more bit of each non-zero coefficient (T.81, G.1.2.3), and the sign of each that becomes
+    /// non-zero.
     fn refine_ac(
         &mut self,
         member: &Member<'_>,
@@ -220,7 +220,7 @@ impl Walk<'_> {
     }
 }
 
-/// The difference of a block's mean to the one before.
+/// Difference of a block's mean from the previous one.
 fn dc(member: &Member<'_>, bits: &mut Bits<'_>) -> Result<(), Broken> {
     let table = member.dc.ok_or(Broken::Corrupt)?;
     let size = bits.symbol(table)?;
@@ -230,7 +230,7 @@ fn dc(member: &Member<'_>, bits: &mut Bits<'_>) -> Result<(), Broken> {
     bits.take(size.into()).map(|_| ())
 }
 
-/// All other coefficients of a block of a sequential picture (T.81, F.1.2.2).
+/// All other coefficients of a block in a sequential picture (T.81, F.1.2.2).
 fn sequential_ac(member: &Member<'_>, bits: &mut Bits<'_>) -> Result<(), Broken> {
     let mut k = 1;
     while k < BLOCK {
@@ -251,7 +251,7 @@ fn sequential_ac(member: &Member<'_>, bits: &mut Bits<'_>) -> Result<(), Broken>
     Ok(())
 }
 
-/// How many coefficients are 0, and the bits of the one after them.
+/// Number of zero coefficients, and bits of the one after them.
 fn run_and_size(member: &Member<'_>, bits: &mut Bits<'_>) -> Result<(u32, u32), Broken> {
     let table = member.ac.ok_or(Broken::Corrupt)?;
     let symbol = u32::from(bits.symbol(table)?);

@@ -1,7 +1,6 @@
-//! What the check promises: nothing that a decoder makes up passes, and nothing that is whole is
-//! refused.
+//! Promises of the check: nothing that a decoder invents passes, and no complete file is refused.
 //!
-//! The files are one synthetic picture, written by libjpeg-turbo.
+//! The files show one synthetic picture, written by libjpeg-turbo.
 
 use std::io::Cursor;
 
@@ -28,14 +27,14 @@ const GOOD: Whole = Whole {
     suspect: false,
 };
 
-/// What the decoder makes of a file, with an end where it has none.
+/// The decoder's output for a file, with an end marker added if missing.
 fn pixels(bytes: &[u8]) -> Option<Vec<u8>> {
     let bytes = [bytes, &END].concat();
     let reader = ImageReader::with_format(Cursor::new(bytes), ImageFormat::Jpeg);
     Some(reader.decode().ok()?.into_bytes())
 }
 
-/// The place behind the header of the first scan.
+/// Position after the header of the first scan.
 fn first_data(bytes: &[u8]) -> usize {
     let mut bits = Bits::new(bytes, 2);
     loop {
@@ -51,10 +50,10 @@ fn first_data(bytes: &[u8]) -> usize {
 fn whole_files_are_whole() {
     for (name, bytes) in FILES {
         assert_eq!(check(bytes), Ok(GOOD), "{name}");
-        // What lies behind the picture is not looked at.
+        // Data after the picture is ignored.
         let and_more = [bytes, &[0xff, 0xd8, 0xff, 0xda, 0, 1, 2]].concat();
         assert_eq!(check(&and_more), Ok(GOOD), "{name}");
-        // All of the picture without its end, and a byte more.
+        // The whole picture without its end marker, and one byte more.
         let endless = Whole {
             ended: false,
             ..GOOD
@@ -117,7 +116,7 @@ fn lost_restarts_are_refused() {
     assert!(pixels(&without).is_some());
 }
 
-/// Where a disk loses a piece of a file there are zeros.
+/// Lost pieces of a file on disk read as zeros.
 #[test]
 fn a_hole_is_noticed() {
     let (mut holes, mut unnoticed) = (0, 0);
@@ -132,14 +131,14 @@ fn a_hole_is_noticed() {
             unnoticed += usize::from(unseen);
         }
     }
-    // JPEG has no checksum, and zeros are data too: the walk may come back into step. Measured: 16
-    // of 600.
+    // JPEG has no checksum, and zeros are data too, so the walk may come back into step. Measured:
+    // 16 of 600.
     assert!(unnoticed * 20 <= holes, "{unnoticed} of {holes} holes");
 }
 
 #[test]
 fn more_data_than_the_picture_takes_is_told() {
-    // Half of the height is all that the header asks for.
+    // The header asks for only half of the height.
     let mut bytes = SEQUENTIAL.to_vec();
     let header = bytes
         .windows(2)
@@ -152,7 +151,7 @@ fn more_data_than_the_picture_takes_is_told() {
         ..GOOD
     };
     assert_eq!(check(&bytes), Ok(suspect));
-    // Without an end that is a file cut off and filled up.
+    // Without an end marker, that is a file cut off and padded.
     bytes.truncate(bytes.len() - 2);
     bytes.extend([0; 100]);
     assert!(check(&bytes).unwrap_err().contains("end is missing"));

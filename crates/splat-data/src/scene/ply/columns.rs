@@ -1,4 +1,4 @@
-//! Where the values of a Gaussian are in a row of the file, and which values they may have.
+//! Position of a Gaussian's values in a row of the file, and their allowed values.
 
 use std::path::Path;
 
@@ -7,7 +7,7 @@ use ply_rs_bw::ply::{Header, PropertyType};
 use super::super::{SceneFileError, SplatData};
 use super::Row;
 
-/// Where in a row each value of a Gaussian is.
+/// Column of each value of a Gaussian.
 pub(super) struct Columns {
     means: [usize; 3],
     sh0: [usize; 3],
@@ -99,8 +99,8 @@ impl Columns {
         }
     }
 
-    /// Appends the row's Gaussian to `scene`; or returns the first column, in the order of the
-    /// fields, whose value means nothing (see [`may_be`]).
+    /// Appends the row's Gaussian to `scene`, or returns the first column, in the order of the
+    /// fields, whose value is not allowed (see [`may_be`]).
     pub(super) fn take(&self, row: &Row, scene: &mut SplatData) -> Result<(), usize> {
         let value = |column: usize| {
             let value = row.values[column];
@@ -137,9 +137,9 @@ impl Columns {
     }
 }
 
-/// Whether a property may have this value. Infinity is one where it means something: opacity logits
-/// of plus and minus infinity are opacities of 1 and 0, and a log-scale of minus infinity is a flat
-/// Gaussian.
+/// True if a property may have this value. Infinity is allowed where it has a meaning: opacity
+/// logits of plus and minus infinity are opacities of 1 and 0, and a log-scale of minus infinity is
+/// a flat Gaussian.
 pub(super) fn may_be(property: &str, value: f32) -> bool {
     match property {
         "opacity" => !value.is_nan(),

@@ -1,5 +1,4 @@
-//! What the comments of a PLY header say about a scene: where its means count from, and how it must
-//! be rendered.
+//! Scene settings in the comments of a PLY header: the origin of the means, and how to render them.
 //!
 //! ```text
 //! comment burn-splat origin X Y Z
@@ -8,14 +7,14 @@
 //! comment burn-splat background R G B
 //! ```
 //!
-//! Comments are prose, so what is ours begins with a word that nothing else begins with, and
-//! anything else is passed over. Exceptions are tags that others use, `SplatRenderMode:
-//! default|mip|2dgs` and `antialiased 0|1`, which are written too, and `origin X Y Z` with three
-//! finite numbers, the form of earlier versions.
+//! Comments are free text, so ours begin with a unique word and all others are ignored. The
+//! exceptions are tags of other programs, `SplatRenderMode: default|mip|2dgs` and `antialiased
+//! 0|1`, which are written too, and `origin X Y Z` with three finite numbers, the form of earlier
+//! versions.
 //!
-//! What begins with our word and names a setting must be readable: to guess would be to render
-//! something else. A setting with a name that we do not know (of a later version, perhaps) is told
-//! by [`SceneSettings::not_understood`].
+//! A comment with our word and a known setting must be readable; guessing would render something
+//! else. Unknown settings, perhaps of a later version, are collected in
+//! [`SceneSettings::not_understood`].
 
 use std::path::Path;
 use std::str::FromStr;
@@ -26,7 +25,7 @@ use crate::SceneScale;
 /// First word of our comments.
 const OURS: &str = "burn-splat";
 
-/// The comments of a scene, without the word `comment`.
+/// Comments of a scene, without the word `comment`.
 pub(super) fn write(path: &Path, scene: &SplatData) -> Result<Vec<String>, SceneFileError> {
     let bad = |setting, value: &dyn std::fmt::Debug, must_be| SceneFileError::Setting {
         path: path.to_path_buf(),
@@ -65,7 +64,7 @@ pub(super) fn write(path: &Path, scene: &SplatData) -> Result<Vec<String>, Scene
     Ok(comments)
 }
 
-/// The origin and the settings that comments tell.
+/// Origin and settings from the comments.
 pub(super) fn read(
     path: &Path,
     comments: &[String],
@@ -98,7 +97,7 @@ pub(super) fn read(
     Ok((origin.unwrap_or_default(), settings))
 }
 
-/// What was read so far.
+/// Settings read so far.
 #[derive(Default)]
 struct Found {
     origin: Option<[f64; 3]>,
@@ -108,7 +107,7 @@ struct Found {
 }
 
 impl Found {
-    /// Takes a comment of ours: whether it is understood, or why it cannot be.
+    /// Reads one of our comments: returns whether it is understood, or why it is invalid.
     fn ours(&mut self, name: &str, values: &[&str]) -> Result<bool, String> {
         match name {
             "origin" => {
@@ -136,10 +135,10 @@ impl Found {
         Ok(true)
     }
 
-    /// Takes a comment that other programs, or earlier versions, write; everything else is prose.
+    /// Reads a comment of other programs or earlier versions; anything else is free text.
     fn others(&mut self, words: &[&str]) -> Result<bool, String> {
         match words {
-            // Where two programs say two things, the first is followed, and the second told.
+            // If two programs disagree, the first comment wins, and the second is reported.
             ["SplatRenderMode:", mode] => {
                 return Ok(match *mode {
                     "default" => set(&mut self.antialias, false).is_ok(),
@@ -156,7 +155,7 @@ impl Found {
                 match read.filter(|value| value.is_finite()).count() {
                     3 => set(&mut self.origin, numbers(values).unwrap_or_default())?,
                     0 => {}
-                    // Neither prose nor an origin.
+                    // Neither free text nor an origin.
                     _ => return Ok(false),
                 }
             }
@@ -166,7 +165,7 @@ impl Found {
     }
 }
 
-/// Puts a value where none was, or the same.
+/// Sets a value that is unset or equal.
 fn set<T: PartialEq>(place: &mut Option<T>, value: T) -> Result<(), String> {
     match place {
         Some(other) if *other != value => {

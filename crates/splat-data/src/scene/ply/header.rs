@@ -1,8 +1,8 @@
-//! The header of a PLY file, made plain before it is parsed.
+//! Normalises the header of a PLY file before it is parsed.
 //!
-//! Headers come from many programs and text editors. A byte-order mark before `ply`, blank lines,
-//! indentation, carriage returns before line feeds, comments before `format`, and comments in
-//! another encoding than UTF-8 change nothing.
+//! Headers come from many programs and text editors. These variations are accepted: a byte-order
+//! mark before `ply`, blank lines, indentation, carriage returns before line feeds, comments before
+//! `format`, and comments that are not UTF-8.
 
 use std::io::{BufRead, Read};
 use std::path::Path;
@@ -14,12 +14,12 @@ use super::super::SceneFileError;
 use super::repetition::repetition;
 use super::{Row, one_line};
 
-/// A header is no longer than this many bytes: what is longer is something else.
+/// Longest accepted header in bytes; anything longer is not a PLY header.
 const LONGEST: u64 = 1 << 20;
 /// UTF-8's byte-order mark.
 const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
 
-/// Reads the header, and leaves `reader` behind it.
+/// Reads the header, leaving `reader` after it.
 pub(super) fn read(
     reader: &mut impl BufRead,
     parser: &Parser<Row>,
@@ -58,7 +58,7 @@ pub(super) fn read(
         if read == 0 {
             return Err(bad("it ends without the line `end_header`".into()));
         }
-        // A blank line counts as one, for the numbers of lines in messages.
+        // Blank lines count towards the line numbers in messages.
         text += &match line {
             "" => "comment".to_owned(),
             line => line.replace('\r', " "),
@@ -77,7 +77,7 @@ pub(super) fn read(
     let header = parser.read_header(&mut Reader::new(text.as_bytes()));
     header.map_err(|error| {
         let message = error.to_string();
-        // What follows is about the grammar, not about the file.
+        // The rest is about the grammar, not about the file.
         let (message, _) = message.split_once("\n\tError:").unwrap_or((&message, ""));
         bad(one_line(message))
     })

@@ -1,9 +1,9 @@
-//! Names that a PLY header says twice.
+//! Detection of repeated names in a PLY header.
 
 use std::collections::HashSet;
 
-/// The first line that repeats the name of an element, or that of a property of its element. The
-/// library would keep one of the two, and read every value behind it from the wrong place.
+/// The first line that repeats the name of an element, or of a property within its element. The
+/// library would keep only one of the two, and read all later values from the wrong position.
 pub(super) fn repetition(header: &str) -> Option<&str> {
     let (mut elements, mut properties) = (HashSet::new(), HashSet::new());
     for line in header.lines() {

@@ -1,4 +1,4 @@
-//! What the reader and the writer promise.
+//! Promises of the reader and the writer.
 
 use std::path::PathBuf;
 
@@ -7,7 +7,7 @@ use tempfile::TempDir;
 use super::super::SceneSettings;
 use super::*;
 
-/// A scene whose every value is another one.
+/// A scene in which all values differ.
 fn scene(count: usize, sh_degree: usize) -> SplatData {
     let mut next = 0.0f32;
     let mut value = || {
@@ -34,8 +34,8 @@ fn file_in(folder: &TempDir) -> PathBuf {
     folder.path().join("scene.ply")
 }
 
-/// Writes `bytes` as a file and returns the message of reading it, which must name the file in one
-/// line.
+/// Writes `bytes` to a file and returns the error of reading it, which must be one line and name
+/// the file.
 fn error_of(bytes: &[u8]) -> SceneFileError {
     let folder = TempDir::new().unwrap();
     let path = file_in(&folder);
@@ -47,7 +47,7 @@ fn error_of(bytes: &[u8]) -> SceneFileError {
     error
 }
 
-/// Header and values of `scene` as text, the properties turned back to front, without normals.
+/// Header and values of `scene` as text, with the properties in reverse order and without normals.
 fn ascii(scene: &SplatData, kind: &str) -> String {
     let names = property_names(scene.sh_rest_len());
     let keep = |i: &usize| !names[*i].starts_with('n');
@@ -85,7 +85,7 @@ fn round_trip_is_exact_in_every_degree() {
             scene.means[3].map(f32::to_bits)
         );
     }
-    // Nothing is left beside the file.
+    // No other file is left.
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
 }
 
@@ -218,7 +218,7 @@ fn values_that_are_not_finite_are_named() {
     let path = file_in(&folder);
     let message = write(&path, &bad).unwrap_err().to_string();
     assert!(message.contains("Gaussian 2: scale_1 is NaN"), "{message}");
-    // Nothing is half-written.
+    // No partial file is left.
     assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 0);
 }
 
@@ -275,7 +275,7 @@ fn headers_that_do_not_fit_are_named() {
     assert!(message(&text.replace("float opacity", "uint packed_position")).contains("compressed"));
     assert!(message("solid cube\n").contains("no PLY header"));
     assert!(message("").contains("no PLY header"));
-    // A name given twice would shift every value behind it.
+    // A repeated name would shift all later values.
     message(&text.replace("float f_dc_0", "float f_dc_1"));
 }
 
@@ -293,7 +293,7 @@ fn arrays_that_do_not_fit_are_named() {
     assert!(write(file_in(&folder), &bad).is_err());
 }
 
-/// A text file of one Gaussian with these lines after the first, the values last.
+/// A text file of one Gaussian with these lines inserted after the first; the values come last.
 fn with_lines(lines: &str) -> Vec<u8> {
     let text = ascii(&scene(1, 0), "float");
     text.replacen("format ascii 1.0\ncomment by hand\n", lines, 1)
@@ -320,7 +320,7 @@ fn origin_and_settings_survive() {
     assert_eq!(read(&path).unwrap(), scene);
     let bytes = std::fs::read(&path).unwrap();
     let header = String::from_utf8_lossy(&bytes);
-    // For other programs.
+    // Comments for other programs.
     for line in [
         "comment SplatRenderMode: mip\n",
         "comment antialiased 1\n",
@@ -332,7 +332,7 @@ fn origin_and_settings_survive() {
         assert!(header.contains(line), "no `{line}`");
     }
 
-    // An origin is a place: what begins like ours is no guess.
+    // A comment that begins with our word must be a valid origin.
     let at = bytes.windows(7).position(|w| w == b"4500000").unwrap();
     let spoilt = [&bytes[..at], b"4500x00", &bytes[at + 7..]].concat();
     let message = error_of(&spoilt).to_string();
@@ -377,7 +377,7 @@ fn prose_in_comments_is_passed_over() {
         let read = read_bytes(&with_lines(&format!("{format}comment {prose}\n")));
         assert_eq!(read.unwrap(), scene(1, 0), "`{prose}`");
     }
-    // The form of earlier versions is still an origin.
+    // The form of earlier versions is still accepted.
     let old = read_bytes(&with_lines(&format!("{format}comment origin 1 -2e3 0.5\n"))).unwrap();
     assert_eq!(old.origin, [1.0, -2000.0, 0.5]);
 }
@@ -407,7 +407,7 @@ fn comments_that_almost_say_something_are_told_or_refused() {
         let message = read(&format!("comment {refused}")).unwrap_err().to_string();
         assert!(message.contains(refused), "{message}");
     }
-    // Two comments: of ours they must agree, of others the first counts, ours before theirs.
+    // Two comments: ours must agree; of others the first wins; ours take precedence.
     let both = |a: &str, b: &str| read(&format!("comment {a}\ncomment {b}"));
     let message = both("burn-splat antialias 1", "burn-splat antialias 0").unwrap_err();
     assert!(message.to_string().contains("something else"), "{message}");
@@ -480,7 +480,7 @@ fn odd_headers_are_read() {
             "{name}"
         );
     }
-    // Behind the last line of a header with carriage returns come the values, to the byte.
+    // After a header with carriage returns, the values follow exactly.
     let folder = TempDir::new().unwrap();
     write(file_in(&folder), &scene(2, 1)).unwrap();
     let bytes = std::fs::read(file_in(&folder)).unwrap();
@@ -500,7 +500,7 @@ fn odd_headers_are_read() {
     );
 }
 
-/// Neither a header without an end nor an element of nothing takes time or memory.
+/// An endless header or an empty element takes neither time nor memory.
 #[test]
 fn headers_that_announce_too_much_end_soon() {
     let endless = [b"ply\ncomment ".to_vec(), vec![b'x'; 3 << 20]].concat();
@@ -520,8 +520,8 @@ fn headers_that_announce_too_much_end_soon() {
     assert_eq!(read_bytes(&padded).unwrap(), scene(1, 0));
 }
 
-/// Of two properties of one name the library keeps one, and reads every value behind it from the
-/// wrong place.
+/// Of two properties with one name the library keeps one, and reads all later values from the wrong
+/// position.
 #[test]
 fn a_name_that_occurs_twice_is_refused_whatever_it_names() {
     let text = ascii(&scene(2, 0), "float");
@@ -540,7 +540,7 @@ fn a_name_that_occurs_twice_is_refused_whatever_it_names() {
         assert!(message.contains("spare"), "{message}");
         assert!(message.contains("repeats a name"), "{message}");
     }
-    // In different elements it is no repetition.
+    // In different elements it is not a repetition.
     let two = "element camera 0\nproperty float x\nelement vertex 2\n";
     let two = text.replace("element vertex 2\n", two);
     assert_eq!(
@@ -549,7 +549,8 @@ fn a_name_that_occurs_twice_is_refused_whatever_it_names() {
     );
 }
 
-/// Nothing of such an element is in the file: counting to its end took as long as its count says.
+/// Such an element takes no bytes in the file; counting through it took time proportional to its
+/// count.
 #[test]
 fn an_element_without_properties_takes_no_time() {
     let folder = TempDir::new().unwrap();
@@ -572,7 +573,7 @@ fn a_line_with_more_values_than_the_header_knows_is_refused() {
     );
 }
 
-/// What never ends its header is another kind of file, and not read to its end.
+/// A file without an end of header is of another kind, and is not read to its end.
 #[test]
 fn a_header_without_end_is_given_up() {
     let text = format!(
