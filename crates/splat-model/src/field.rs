@@ -1,5 +1,4 @@
-//! The trained parameters of a model, by name: which have a row per Gaussian, and how fast each is
-//! trained.
+//! Trained parameters of a model, by name: their row sets and learning rates.
 
 use splat_data::SceneScale;
 
@@ -18,23 +17,23 @@ pub const GAUSSIANS: usize = 0;
 /// ```
 #[derive(Debug, Clone, PartialEq)]
 pub struct Field {
-    /// What strategies and settings call it; no two fields of a model share a name. Every model
-    /// that the strategies of this crate work on has `means`, `log_scales`, `quats` and
-    /// `opacity_logits`, as [`Gaussians`](crate::Gaussians) has.
+    /// Name used by strategies and settings, unique within a model. The strategies of this crate
+    /// need `means`, `log_scales`, `quats` and `opacity_logits`, as in
+    /// [`Gaussians`](crate::Gaussians).
     pub name: String,
-    /// Where Burn finds the parameter in the module: `means`, or `gaussians.means` in a model that
-    /// is made of one.
+    /// Path of the parameter in the Burn module: `means`, or `gaussians.means` in a model that
+    /// contains one.
     pub path: String,
-    /// The row set that its first dimension runs over; none for a parameter without a row per
-    /// Gaussian, which no edit of rows touches. [`GAUSSIANS`] is the set of all; a model may have
-    /// others, with fewer rows.
+    /// Row set of the first dimension, or `None` for a parameter without rows, which row edits
+    /// leave alone. [`GAUSSIANS`] is the set of all Gaussians; a model may have others, with fewer
+    /// rows.
     pub row_set: Option<usize>,
     /// Learning rate at the first step.
     pub rate: f64,
-    /// The rate decays exponentially to this share of itself at the last step. 1: it is constant.
+    /// The rate decays exponentially to this share of itself at the last step. 1 means constant.
     pub final_share: f64,
-    /// Whether values are lengths in world units: then the rate is in units of the scene's size,
-    /// and Adam's epsilon, one over a length, follows it too.
+    /// True if values are lengths in world units. Then the rate is in units of the scene's size,
+    /// and so is Adam's epsilon, one over a length.
     pub is_length: bool,
 }
 
@@ -52,7 +51,7 @@ impl Field {
         }
     }
 
-    /// A parameter that has no row per Gaussian: trained, and never edited.
+    /// A parameter without rows: trained, but never edited.
     pub fn shared(name: impl Into<String>, rate: f64) -> Self {
         Self {
             row_set: None,
@@ -60,28 +59,28 @@ impl Field {
         }
     }
 
-    /// The same with values that are lengths in world units.
+    /// Declares values to be lengths in world units.
     #[must_use]
     pub fn in_lengths(mut self) -> Self {
         self.is_length = true;
         self
     }
 
-    /// The same with a rate that decays to a share of itself.
+    /// Makes the rate decay to a share of itself.
     #[must_use]
     pub fn decaying_to(mut self, share: f64) -> Self {
         self.final_share = share;
         self
     }
 
-    /// The same in another row set.
+    /// Moves the field to another row set.
     #[must_use]
     pub fn in_row_set(mut self, row_set: usize) -> Self {
         self.row_set = Some(row_set);
         self
     }
 
-    /// The same in a module that holds the model under this name.
+    /// Prefixes the path with the name of the module that contains the model.
     #[must_use]
     pub fn nested(mut self, module: &str) -> Self {
         self.path = format!("{module}.{}", self.path);

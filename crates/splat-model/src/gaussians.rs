@@ -1,4 +1,4 @@
-//! The model: a set of 3D Gaussians as a Burn module (3DGS section 4).
+//! The model: 3D Gaussians as a Burn module (3DGS section 4).
 
 use burn::module::{Module, Param};
 use burn::tensor::{DType, Device, Tensor, TensorData};
@@ -10,7 +10,7 @@ use splat_ops::{
 
 use splat_data::{SceneSettings, SplatData};
 
-/// N Gaussians. Parameters are stored before their activation, as in 3DGS: scales as logarithms,
+/// N Gaussians. Parameters are stored before activation, as in 3DGS: scales as logarithms,
 /// opacities as logits.
 ///
 /// ```
@@ -35,8 +35,8 @@ use splat_data::{SceneSettings, SplatData};
 /// ```
 #[derive(Module, Debug)]
 pub struct Gaussians {
-    /// Where in the world the means count from, see [`SplatData::origin`]. Cameras that look at the
-    /// model must count from there too: [`Camera::relative_to`](crate::Camera::relative_to).
+    /// Origin of the means in the world, see [`SplatData::origin`]. Cameras must be relative to it
+    /// too: [`Camera::relative_to`](crate::Camera::relative_to).
     #[module(skip)]
     pub origin: [f64; 3],
     /// Centres relative to the origin, `[N, 3]`, world units.
@@ -54,29 +54,28 @@ pub struct Gaussians {
     pub sh_rest: Option<Param<Tensor<3>>>,
 }
 
-/// How the coefficients of the higher degrees of spherical harmonics are stored: 45 of the 59
-/// floats of a Gaussian of degree 3.
+/// Storage precision of the higher degrees of spherical harmonics, 45 of the 59 floats of a degree
+/// 3 Gaussian.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum ShPrecision {
     /// In single precision.
     #[default]
     Exact,
-    /// In half precision, for rendering: 146 bytes for a Gaussian instead of 236, of which colours
-    /// read 114 instead of
-    /// 204. `docs/ACCURACY.md` has the error.
+    /// In half precision, for rendering only. A Gaussian of degree 3 takes 146 bytes instead of 236,
+    /// and colours read 114 bytes instead of 204 (`docs/notes/half-precision.md`).
     Half,
 }
 
-/// Largest number of half precision.
+/// Largest half-precision number.
 const HALF_MAX: f32 = 65_504.0;
 
 impl Gaussians {
-    /// None at all.
+    /// A model without Gaussians.
     pub fn empty(device: &Device) -> Self {
         Self::from_data(&SplatData::default(), device)
     }
 
-    /// Puts the values of a scene on a device.
+    /// Uploads a scene to a device.
     pub fn from_data(data: &SplatData, device: &Device) -> Self {
         let n = data.means.len();
         let tensor2 = |values: Vec<f32>, width: usize| {
@@ -108,7 +107,7 @@ impl Gaussians {
         }
     }
 
-    /// Reads the values back from the device. How the scene must be rendered is not among them:
+    /// Reads the scene back from the device. Render settings are not part of the model:
     /// [`SplatData::settings`] is empty.
     pub fn to_data(&self) -> SplatData {
         SplatData {
@@ -127,10 +126,10 @@ impl Gaussians {
         }
     }
 
-    /// The same scene, its higher degrees stored as asked for; from half precision there is no way
-    /// back. They are constants then: a model to be trained stays exact. It also stays as it is
-    /// where the device's kernels do not read half precision (no CPU does it to gain), and where a
-    /// coefficient is too large for it.
+    /// Stores the higher degrees with the given precision. Half precision is irreversible and makes
+    /// them constants, so a model to be trained stays exact. The model is unchanged if the device's
+    /// kernels cannot read half precision (as on all CPUs), or if a coefficient is too large for
+    /// it.
     #[must_use]
     pub fn with_sh_precision(mut self, precision: ShPrecision) -> Self {
         if let (ShPrecision::Half, Some(rest)) = (precision, &self.sh_rest) {
@@ -143,7 +142,7 @@ impl Gaussians {
         self
     }
 
-    /// How the coefficients of the higher degrees are stored.
+    /// Storage precision of the higher degrees.
     pub fn sh_precision(&self) -> ShPrecision {
         match self.sh_rest.as_ref().map(|rest| rest.val().dtype()) {
             Some(DType::F16) => ShPrecision::Half,
@@ -151,12 +150,12 @@ impl Gaussians {
         }
     }
 
-    /// N.
+    /// Number of Gaussians, N.
     pub fn len(&self) -> usize {
         self.means.val().dims()[0]
     }
 
-    /// Whether there are none.
+    /// True if there are no Gaussians.
     pub fn is_empty(&self) -> bool {
         self.len() == 0
     }
@@ -180,13 +179,12 @@ impl Gaussians {
         sigmoid(self.opacity_logits.val())
     }
 
-    /// Colours `[C, N, 3]` as cameras with the given centres `[C, 3]` see them, see [`sh_colors`];
-    /// only of those that were not culled, if what the same cameras have `seen` is given (the
-    /// others are black).
+    /// Colours `[C, N, 3]` for cameras with the given centres `[C, 3]`, see [`sh_colors`]. If
+    /// `seen`, the projection to the same cameras, is given, culled Gaussians are skipped and
+    /// black.
     ///
     /// # Errors
-    /// When the model has no coefficients of that degree, or the centres or what was seen do not
-    /// fit.
+    /// When the model lacks coefficients of that degree, or the centres or `seen` do not fit.
     pub fn colors(
         &self,
         centers: Tensor<2>,
@@ -204,7 +202,7 @@ impl Gaussians {
     }
 }
 
-/// A float tensor's values on the host.
+/// Values of a float tensor on the host.
 pub(crate) fn host<const R: usize>(tensor: Tensor<R>) -> Vec<f32> {
     tensor
         .into_data()

@@ -11,19 +11,20 @@ use splat_core::{SH_C0, sh_coefficient_count};
 use splat_data::SceneScale;
 use splat_data::SplatData;
 
-/// Level of 8 bits at which a channel starts that is 0 in the photos.
+/// 8-bit level at which a channel starts that is 0 in the photos.
 const DARKEST_LEVEL: f64 = 0.5;
 
-/// How the first Gaussians are made.
+/// Settings for the initial Gaussians.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Setters)]
 #[serde(default, deny_unknown_fields)]
 #[setters(prefix = "with_", strip_option)]
 pub struct InitSettings {
-    /// Opacity of every Gaussian, between 1/255, below which nothing is drawn, and 1. Default 0.1.
+    /// Opacity of every Gaussian, between 1/255 (below which nothing is drawn) and 1. Default 0.1.
     pub opacity: f64,
-    /// Scale, in root mean squares of the distances to the nearest points. Default 1.
+    /// Factor of the scale, which is the root mean square distance to the nearest points. Default
+    /// 1.
     pub scale: f64,
-    /// Highest degree of spherical harmonics to make room for. Default 3.
+    /// Highest degree of spherical harmonics to allocate. Default 3.
     pub sh_degree: usize,
 }
 
@@ -44,31 +45,31 @@ impl Default for InitSettings {
     }
 }
 
-/// Points that no scene can start from.
+/// Why points cannot start a scene.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum InitError {
-    /// There is none.
+    /// There are no points.
     #[error("no points to start from; the capture needs SfM points (points3D)")]
     NoPoints,
-    /// One is not finite.
+    /// A point is not finite.
     #[error(
         "point {index} of the capture (points3D, counted from 0) lies beyond what 32-bit floats hold; remove it"
     )]
     NotFinite {
-        /// Which one.
+        /// Index of the point.
         index: usize,
     },
 }
 
-/// One Gaussian per point: the point's colour, an isotropic scale of the root mean square of the
-/// distances to its three nearest neighbours, no rotation.
+/// Makes one Gaussian per point, with the point's colour, an isotropic scale (the root mean square
+/// distance to the three nearest neighbours) and no rotation.
 ///
-/// Everything starts where gradients reach it. Neighbours are points in other places, since points
-/// that coincide would have no size (where all do, `scene` gives it); and a channel of level 0
-/// starts at half a level, above the clamp of colours at zero.
+/// Everything starts within reach of gradients. Only points in other places count as neighbours,
+/// since coincident points would give a size of zero (if all coincide, `scene` gives the size). A
+/// channel of level 0 starts at half a level, above the clamp of colours at zero.
 ///
 /// # Errors
-/// When there is no point or one is not finite.
+/// When there are no points, or one is not finite.
 pub fn splats_from_points(
     positions: &[[f32; 3]],
     colors: &[[u8; 3]],
@@ -107,11 +108,11 @@ pub fn splats_from_points(
     })
 }
 
-/// Per point the root mean square of the distances to the three nearest other places where there
-/// are points (fewer where there are fewer); none where all points are in one place.
+/// Root mean square distance of each point to the three nearest other positions (fewer if there are
+/// fewer); `None` if all points coincide.
 fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<Option<f64>> {
     const NEIGHBOURS: usize = 3;
-    // Zero and minus zero are one place.
+    // Zero and minus zero are the same position.
     let place = |position: &[f32; 3]| position.map(|x| (x + 0.0).to_bits());
     let mut indices = HashMap::with_capacity(positions.len());
     let mut places: Vec<[f64; 3]> = Vec::with_capacity(positions.len());
@@ -130,7 +131,7 @@ fn neighbour_distances(positions: &[[f32; 3]]) -> Vec<Option<f64>> {
     let distances: Vec<f64> = places
         .iter()
         .map(|point| {
-            // The nearest place is the point's own.
+            // The nearest position is the point's own.
             let nearest = tree
                 .query(point)
                 .nearest_n::<SquaredEuclidean<f64>>(count)
@@ -166,7 +167,7 @@ mod tests {
         let expected = ((1.0 + 4.0 + 9.0) / 3.0f64).sqrt().ln();
         assert!((f64::from(splats.log_scales[0][0]) - expected).abs() < 1e-6);
         assert_eq!(splats.sh_rest.len(), 5 * 15 * 3);
-        // Four points in the place of the first change nothing for it, and have its scale.
+        // Four points at the position of the first change nothing for it, and get its scale.
         let mut doubled = positions.to_vec();
         doubled.extend([[0.0; 3], [-0.0; 3], [0.0; 3], [0.0; 3]]);
         let colors = [[9; 3]; 9];
@@ -185,7 +186,7 @@ mod tests {
         }
     }
 
-    /// `max(SH + 0.5, 0)` passes nothing on below zero.
+    /// `max(SH + 0.5, 0)` passes no gradient below zero.
     #[test]
     fn no_colour_starts_below_the_clamp() {
         let colors: Vec<[u8; 3]> = (0..=255).map(|level| [level; 3]).collect();

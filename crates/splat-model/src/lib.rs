@@ -1,5 +1,5 @@
-//! Gaussian splat models for Burn: the module, cameras, losses, density control, optimiser.
-//! Everything is an ordinary Burn module or a function on tensors.
+//! Gaussian splat models for Burn: module, cameras, losses, density control, optimiser. Everything
+//! is an ordinary Burn module or a function on tensors.
 
 mod camera;
 mod field;

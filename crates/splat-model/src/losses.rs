@@ -24,8 +24,7 @@ pub fn mse(image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
     (image - target).square().mean()
 }
 
-/// Peak signal-to-noise ratio in dB of images in [0, 1], `[1]`: `-10 log10(mse)`; both are clamped
-/// to [0, 1] first.
+/// Peak signal-to-noise ratio in dB, `[1]`: `-10 log10(mse)` of images clamped to [0, 1].
 pub fn psnr(image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
     mse(image.clamp(0.0, 1.0), target.clamp(0.0, 1.0)).log() * (-10.0 / core::f64::consts::LN_10)
 }
@@ -70,7 +69,7 @@ impl SsimSettings {
         (0..self.window).map(|i| weight(i) / total).collect()
     }
 
-    /// The same as the ops take it.
+    /// The settings in the form of the ops.
     pub fn args(&self) -> SsimArgs {
         SsimArgs {
             window: self.weights(),
@@ -80,13 +79,13 @@ impl SsimSettings {
     }
 }
 
-/// Mean structural similarity (Wang et al. 2004), `[1]`: over channels, and over the pixels whose
-/// window lies inside the image, as scikit-image, torchmetrics and gsplat have it. In an image
-/// smaller than the window every pixel counts, with zeros outside. The target is a constant; of
-/// [`ssim_map`](splat_ops::ssim_map) it is differentiable too.
+/// Mean structural similarity (Wang et al. 2004), `[1]`, over channels and over the pixels whose
+/// window lies inside the image, as in scikit-image, torchmetrics and gsplat. In an image smaller
+/// than the window every pixel counts, with zeros outside. The target is a constant;
+/// [`ssim_map`](splat_ops::ssim_map) is differentiable in both images.
 ///
 /// # Errors
-/// When the shapes differ, the target is tracked by autodiff, or the window's side is even.
+/// When the shapes differ, the target is tracked by autodiff, or the window size is even.
 pub fn ssim(
     image: Tensor<4>,
     target: Tensor<4>,

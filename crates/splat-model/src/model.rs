@@ -1,5 +1,5 @@
-//! What the trainer trains: a Burn module that can be projected and coloured, and says which
-//! parameters it has.
+//! The interface of a trainable model: a Burn module that can be projected and coloured, and lists
+//! its parameters.
 
 use burn::module::Module;
 use burn::tensor::Tensor;
@@ -9,9 +9,10 @@ use splat_ops::{OpError, Projected, ShColorSettings};
 use crate::field::Field;
 use crate::{CameraTensors, Gaussians, LearningRates, RenderSettings};
 
-/// A model of splats: any Burn module that says what to project, how to colour it, and which of its
-/// parameters are trained how. [`Gaussians`] is the first; another is often made of one and some
-/// parameters more:
+/// A splat model: a Burn module that can be projected and coloured, and lists its trained
+/// parameters.
+///
+/// [`Gaussians`] is one. Others often contain it, with additional parameters:
 ///
 /// ```
 /// # use splat_model::{CameraTensors, Field, Gaussians, LearningRates, RenderSettings, SplatModel};
@@ -63,7 +64,7 @@ use crate::{CameraTensors, Gaussians, LearningRates, RenderSettings};
 /// }
 /// ```
 pub trait SplatModel: Module + 'static {
-    /// Where in the world the means count from, see [`SplatData::origin`].
+    /// Origin of the means in the world, see [`SplatData::origin`].
     fn origin(&self) -> [f64; 3];
 
     /// Centres relative to the origin, `[N, 3]`, world units.
@@ -78,7 +79,7 @@ pub trait SplatModel: Module + 'static {
     /// Opacities in (0, 1), `[N]`.
     fn opacities(&self) -> Tensor<1>;
 
-    /// Colours `[C, N, 3]` of what these cameras see. Differentiable.
+    /// Colours `[C, N, 3]` for these cameras. Differentiable.
     ///
     /// # Errors
     /// When shapes do not fit.
@@ -89,12 +90,11 @@ pub trait SplatModel: Module + 'static {
         settings: &RenderSettings,
     ) -> Result<Tensor<3>, OpError>;
 
-    /// The parameters that are trained, with their learning rates: those of the run where the model
-    /// has the same fields as [`Gaussians`]. A parameter that is not among them is neither stepped
-    /// nor edited.
+    /// The trained parameters with their learning rates, from `rates` for the fields of
+    /// [`Gaussians`]. Parameters that are not listed are neither stepped nor edited.
     fn fields(&self, rates: &LearningRates) -> Vec<Field>;
 
-    /// The scene as files hold it; what a file has no place for is left out.
+    /// The scene in the form of files; parameters without a place in a file are left out.
     fn to_data(&self) -> SplatData;
 
     /// Number of Gaussians.

@@ -1,12 +1,12 @@
-//! Neighbours in space become neighbours in memory: the order of Morton (1966), whose codes
-//! interleave the bits of the coordinates. A tile then finds its Gaussians in few pages and lines
-//! of the caches.
+//! Ordering of Gaussians that makes neighbours in space neighbours in memory (Morton 1966), by
+//! interleaving the bits of the coordinates. A tile then finds its Gaussians in few pages and cache
+//! lines.
 
-/// Bits per coordinate: a box a million times the distance of neighbours still tells them apart.
+/// Bits per coordinate: enough to separate neighbours in a box a million times their distance.
 const BITS: u32 = 21;
 
-/// The order in which to store Gaussians with these means: indices, by code. Means that are not
-/// finite come first.
+/// Storage order for Gaussians with these means: indices, sorted by code. Means that are not finite
+/// come first.
 pub(crate) fn order(means: &[[f32; 3]]) -> Vec<usize> {
     let finite = || {
         means
@@ -23,8 +23,8 @@ pub(crate) fn order(means: &[[f32; 3]]) -> Vec<usize> {
     let code = |mean: &[f32; 3]| {
         let bits = [0, 1, 2].map(|axis| {
             let (low, high) = (f64::from(low[axis]), f64::from(high[axis]));
-            // Casts saturate, and make zero of what is not a number: a box without a side, a mean
-            // that is not finite.
+            // The cast saturates and maps NaN to zero: for a box without extent, or a mean that is
+            // not finite.
             spread(((f64::from(mean[axis]) - low) / (high - low) * cells) as u64)
         });
         bits[0] | bits[1] << 1 | bits[2] << 2
@@ -35,7 +35,7 @@ pub(crate) fn order(means: &[[f32; 3]]) -> Vec<usize> {
     order
 }
 
-/// Two zeros after every bit of a number of [`BITS`] bits.
+/// Inserts two zeros after every bit of a number of [`BITS`] bits.
 fn spread(number: u64) -> u64 {
     let mut bits = number.min((1 << BITS) - 1);
     for (shift, mask) in [
@@ -62,7 +62,7 @@ mod tests {
         }
     }
 
-    /// The cells of a cube, in any order, come back octant by octant, and in each by x, y, z.
+    /// The cells of a cube are sorted octant by octant, and in each by x, y, z.
     #[test]
     fn octants_stay_together() {
         let cell = |i: usize| [0, 2, 4].map(|shift| ((i * 37 % 64) >> shift & 3) as f32);

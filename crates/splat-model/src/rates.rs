@@ -1,4 +1,4 @@
-//! Learning rates of the Gaussians (3DGS section 7.1; values of gsplat's default column).
+//! Learning rates of Gaussians (3DGS section 7.1; values of gsplat's default column).
 
 use derive_setters::Setters;
 use serde::{Deserialize, Serialize};
@@ -8,19 +8,19 @@ use serde::{Deserialize, Serialize};
 #[serde(default, deny_unknown_fields)]
 #[setters(prefix = "with_", strip_option)]
 pub struct LearningRates {
-    /// Of the means at the first step, in units of the scene's scale.
+    /// Rate of the means at the first step, in units of the scene's scale.
     pub means: f64,
     /// The means' rate decays exponentially to this share of itself at the last step.
     pub means_final: f64,
-    /// Of the log-scales.
+    /// Rate of the log-scales.
     pub scales: f64,
-    /// Of the quaternions.
+    /// Rate of the quaternions.
     pub quats: f64,
-    /// Of the opacity logits.
+    /// Rate of the opacity logits.
     pub opacities: f64,
-    /// Of the spherical harmonics of degree 0.
+    /// Rate of the spherical harmonics of degree 0.
     pub sh0: f64,
-    /// Of the higher spherical harmonics.
+    /// Rate of the higher spherical harmonics.
     pub sh_rest: f64,
 }
 
@@ -46,7 +46,7 @@ impl Default for LearningRates {
 }
 
 impl LearningRates {
-    /// The rates by name, and how many times its default each is.
+    /// Rates by name, as multiples of their defaults.
     pub fn factors(&self) -> [(&'static str, f64); 6] {
         let default = Self::default();
         [

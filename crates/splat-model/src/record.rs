@@ -1,5 +1,4 @@
-//! Gaussians in Burn's own file format, burnpack: tensors under the paths that they have in the
-//! module.
+//! Gaussians in burnpack, Burn's file format: tensors under their paths in the module.
 
 use std::path::{Path, PathBuf};
 
@@ -10,23 +9,24 @@ use splat_ops::{SH_DEGREE_MAX, sh_coefficient_count};
 
 use crate::Gaussians;
 
-/// Names of the three coordinates of the origin, which are numbers of double precision.
+/// Names of the three coordinates of the origin, stored in double precision.
 const ORIGIN: [&str; 3] = ["origin.x", "origin.y", "origin.z"];
 
-/// Why a record of Gaussians cannot be written or read. One line that names the file and the field.
+/// Why a record of Gaussians cannot be written or read, in one line that names the file and the
+/// field.
 #[derive(Debug, thiserror::Error)]
 #[error("{}: {reason}", path.display())]
 pub struct RecordError {
     /// The file.
     pub path: PathBuf,
-    /// What is wrong.
+    /// The reason.
     pub reason: String,
 }
 
 impl Gaussians {
-    /// Saves all parameters, in single precision, and the origin as a burnpack file, which replaces
-    /// an old one whole or not at all. How the scene is rendered is not part of it; a PLY file
-    /// ([`splat_data::scene::ply`]) has that.
+    /// Saves all parameters, in single precision, and the origin as a burnpack file, replacing an
+    /// old file atomically. Render settings are not included; a PLY file
+    /// ([`splat_data::scene::ply`]) has them.
     ///
     /// ```
     /// # use splat_model::{Gaussians, SplatData};
@@ -88,10 +88,10 @@ impl Gaussians {
         write_durably(path, &bytes).map_err(|error| failed(error.to_string()))
     }
 
-    /// Loads what [`save`](Self::save) wrote, with as many Gaussians as the file has.
+    /// Loads a file written by [`save`](Self::save), with its number of Gaussians.
     ///
     /// # Errors
-    /// When the file cannot be read, is not such a file, or holds NaN.
+    /// When the file cannot be read, is not such a file, or contains NaN.
     pub fn load(path: impl AsRef<Path>, device: &Device) -> Result<Self, RecordError> {
         let path = path.as_ref();
         let failed = |reason: String| RecordError {
@@ -102,7 +102,7 @@ impl Gaussians {
         Self::parse(path, bytes, device)
     }
 
-    /// [`load`](Self::load) on the content of a file; `path` is for messages.
+    /// [`load`](Self::load) from the contents of a file; `path` is used in messages.
     ///
     /// # Errors
     /// Those of [`load`](Self::load).
@@ -115,7 +115,7 @@ impl Gaussians {
     }
 }
 
-/// The first field with a value that is no number.
+/// The first field that contains NaN.
 fn with_nan(data: &SplatData) -> Option<&'static str> {
     let fields: [(&'static str, &[f32]); 6] = [
         ("means", data.means.as_flattened()),
@@ -236,8 +236,8 @@ impl Fields {
         Some((shape, values))
     }
 
-    /// The values of a field with `width` numbers a row, and the number of its rows, which must be
-    /// `n` where that is known.
+    /// Values of a field of `width` numbers per row, and its number of rows, which must equal `n`
+    /// if given.
     fn rows(
         &mut self,
         name: &str,

@@ -1,4 +1,4 @@
-//! The three ops composed: Gaussians and a camera to an image.
+//! The three ops composed: from Gaussians and a camera to an image.
 
 use burn::tensor::Tensor;
 use derive_setters::Setters;
@@ -10,19 +10,20 @@ use splat_ops::{
 
 use crate::{CameraTensors, SplatModel};
 
-/// How to render.
+/// Render settings.
 #[derive(Debug, Clone, PartialEq, Setters)]
 #[setters(prefix = "with_", strip_option)]
 pub struct RenderSettings {
-    /// Highest degree of spherical harmonics to evaluate; at most what the model has. Default 3:
-    /// all of them.
+    /// Highest degree of spherical harmonics to evaluate, limited by the model. Default 3, which
+    /// means all.
     pub sh_degree: usize,
-    /// Gradient of the clamp of colours at zero; [`ClampGradient::Recovering`] for training.
-    /// Default exact.
+    /// Gradient of the clamp of colours at zero. Default exact; use [`ClampGradient::Recovering`]
+    /// for training.
     pub clamp_gradient: ClampGradient,
-    /// Multiply opacities by what the low-pass filter took away (Yu et al. 2024, Mip-Splatting).
+    /// Multiplies opacities by the compensation of the low-pass filter (Yu et al. 2024,
+    /// Mip-Splatting). Default false.
     pub antialias: bool,
-    /// Colour behind everything; black (and no work) without one.
+    /// Background colour. `None` is black, at no cost.
     pub background: Option<[f32; 3]>,
     /// Settings of the projection.
     pub project: ProjectSettings,
@@ -51,25 +52,25 @@ impl RenderSettings {
 }
 
 impl RenderSettings {
-    /// How to render a scene as it was trained, as far as its file says, up to its degree of
-    /// spherical harmonics: without anti-aliasing and in front of black where it does not.
+    /// Settings that render a scene as it was trained, from its file, up to its degree of spherical
+    /// harmonics. If the file does not say: without anti-aliasing, on black.
     pub fn of_scene(scene: &SplatData) -> Self {
         let settings = &scene.settings;
         Self {
             sh_degree: scene.sh_degree,
             project: scene.scene_scale().project_settings(),
             antialias: settings.antialias.unwrap_or_default(),
-            // Black is what costs nothing.
+            // `None` gives black at no cost.
             background: settings.background.filter(|color| *color != [0.0; 3]),
             ..Self::default()
         }
     }
 }
 
-/// Renders Gaussians in C cameras: the image `[C, H, W, 3]` and alpha `[C, H, W, 1]`.
+/// Renders Gaussians in C cameras: image `[C, H, W, 3]` and alpha `[C, H, W, 1]`.
 ///
 /// # Errors
-/// See [`project`] and [`rasterize`].
+/// Those of [`project`] and [`rasterize`].
 pub fn render<M: SplatModel>(
     model: &M,
     cameras: &CameraTensors,
@@ -82,7 +83,7 @@ pub fn render<M: SplatModel>(
 /// The first half of [`render`]: screen splats.
 ///
 /// # Errors
-/// See [`project`].
+/// Those of [`project`].
 pub fn project_gaussians<M: SplatModel>(
     model: &M,
     cameras: &CameraTensors,
@@ -99,11 +100,11 @@ pub fn project_gaussians<M: SplatModel>(
     )
 }
 
-/// The second half of [`render`]: colours and blending. Between the halves a trainer puts a screen
-/// probe, a researcher whatever is being researched.
+/// The second half of [`render`]: colours and blending. Screen probes, or anything else, can go
+/// between the halves.
 ///
 /// # Errors
-/// See [`sh_colors`](splat_ops::sh_colors) and [`rasterize`].
+/// Those of [`sh_colors`](splat_ops::sh_colors()) and [`rasterize`].
 pub fn render_projected<M: SplatModel>(
     model: &M,
     projected: &Projected,
@@ -113,10 +114,10 @@ pub fn render_projected<M: SplatModel>(
     render_projected_on(model, projected, cameras, None, settings)
 }
 
-/// [`render_projected`] in front of a background `[C, 3]`, instead of that of the settings.
+/// [`render_projected`] on a background `[C, 3]` instead of that of the settings.
 ///
 /// # Errors
-/// As those of [`render_projected`], and when the background does not fit.
+/// Those of [`render_projected`], and when the background does not fit.
 pub fn render_projected_on<M: SplatModel>(
     model: &M,
     projected: &Projected,

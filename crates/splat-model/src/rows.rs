@@ -1,21 +1,21 @@
-//! Edits of the rows of a model: what each new row is made from.
+//! Row edits of a model, in terms of its old rows.
 
 use std::collections::BTreeMap;
 
 use crate::field::GAUSSIANS;
 
-/// Whether the moments of a row go on or start anew.
+/// Whether the moments of a row continue or restart.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Moments {
-    /// They are those of the row that it is made from.
+    /// Moments of the source row.
     Keep,
-    /// They are zero, as of a parameter that was never stepped.
+    /// Zero moments, as for a parameter that was never stepped.
     Restart,
 }
 
-/// The rows of a row set after an edit, in terms of those before. All fields of the set are edited
-/// alike, and their moments with them; what differs between fields is said by
-/// [`offset`](Self::offset) and [`set`](Self::set).
+/// Rows of a row set after an edit, in terms of the old rows. All fields of the set are edited
+/// alike, with their moments; [`offset`](Self::offset) and [`set`](Self::set) give differences
+/// between fields.
 ///
 /// ```
 /// use splat_model::{Moments, RowEdit};
@@ -57,25 +57,25 @@ enum ChangeKind {
     Set,
 }
 
-/// Changes of one field: values `[N_new, width]`, and which of them count.
+/// Changes of one field: values `[N_new, width]`, and the rows they apply to.
 #[derive(Debug, Default)]
 pub(crate) struct FieldChanges {
-    /// Added to the gathered rows; zero where a row has none.
+    /// Added to the gathered rows; zero for rows without an offset.
     pub offsets: Option<Vec<f32>>,
-    /// Rows that are replaced after that, and by what, one after the other.
+    /// Rows that are then replaced, and their new values in sequence.
     pub set_rows: Vec<usize>,
     pub set_values: Vec<f32>,
 }
 
 impl Default for RowEdit {
-    /// No rows, of the set of all Gaussians.
+    /// No rows, in the set of all Gaussians.
     fn default() -> Self {
         Self::of_row_set(GAUSSIANS)
     }
 }
 
 impl RowEdit {
-    /// No rows, of one row set of the model.
+    /// No rows, in one row set of the model.
     pub fn of_row_set(row_set: usize) -> Self {
         Self {
             row_set,
@@ -83,7 +83,7 @@ impl RowEdit {
         }
     }
 
-    /// All of `count` rows as they are: the beginning of an edit in place, such as a relocation.
+    /// All of `count` rows unchanged, as the start of an edit in place, such as a relocation.
     pub fn identity(count: usize) -> Self {
         let mut edit = Self::default();
         (0..count).for_each(|row| {
@@ -92,7 +92,7 @@ impl RowEdit {
         edit
     }
 
-    /// Adds a row made from an old one, and returns its index.
+    /// Adds a row made from an old one; returns its index.
     pub fn push(&mut self, source: usize, moments: Moments) -> usize {
         self.rows.push(NewRow {
             source: source as u32,
@@ -102,25 +102,24 @@ impl RowEdit {
         self.rows.len() - 1
     }
 
-    /// Makes a new row from another old one, as when a dead Gaussian is moved to where one is
-    /// needed.
+    /// Changes the source of a new row, for example to move a dead Gaussian to where one is needed.
     pub fn relocate(&mut self, row: usize, source: usize, moments: Moments) {
         let row = &mut self.rows[row];
         (row.source, row.moments) = (source as u32, moments);
     }
 
-    /// What becomes of the moments of a new row.
+    /// Sets what happens to the moments of a new row.
     pub fn set_moments(&mut self, row: usize, moments: Moments) {
         self.rows[row].moments = moments;
     }
 
-    /// Adds to the values that a new row has in a field: as many as the field is wide.
+    /// Adds to a new row's values in a field; `values` has the width of the field.
     pub fn offset(&mut self, row: usize, field: &str, values: &[f32]) {
         self.change(row, field, ChangeKind::Offset, values);
     }
 
-    /// Replaces the values that a new row has in a field, as many as the field is wide; what is
-    /// offset beside is then without effect.
+    /// Replaces a new row's values in a field; `values` has the width of the field. Offsets of the
+    /// same field then have no effect.
     pub fn set(&mut self, row: usize, field: &str, values: &[f32]) {
         self.change(row, field, ChangeKind::Set, values);
     }
@@ -138,7 +137,7 @@ impl RowEdit {
         self.rows.len()
     }
 
-    /// Whether no row is left.
+    /// True if no row is left.
     pub fn is_empty(&self) -> bool {
         self.rows.is_empty()
     }
@@ -148,17 +147,17 @@ impl RowEdit {
         self.row_set
     }
 
-    /// The old row that each new one is made from.
+    /// Source row of each new row.
     pub fn sources(&self) -> Vec<u32> {
         self.rows.iter().map(|row| row.source).collect()
     }
 
-    /// Which moments go on, by new row.
+    /// Moments of each new row.
     pub fn moments(&self) -> Vec<Moments> {
         self.rows.iter().map(|row| row.moments).collect()
     }
 
-    /// What a new row's values in a field are shifted by, if they are.
+    /// Offset of a new row's values in a field, if any.
     pub fn offset_of(&self, row: usize, field: &str) -> Option<&[f32]> {
         let changes = self.rows[row].changes.iter();
         let mut offsets =
@@ -175,7 +174,7 @@ impl RowEdit {
         });
     }
 
-    /// Orders the new rows so that neighbours in space are neighbours in memory, given the old
+    /// Orders the new rows so that neighbours in space are neighbours in memory, from the old
     /// means.
     pub fn arrange(&mut self, means: &[[f32; 3]]) {
         let means: Vec<[f32; 3]> = (0..self.len())
@@ -207,7 +206,7 @@ impl RowEdit {
         })
     }
 
-    /// The changes of all fields that have any, of widths that fit.
+    /// Changes of all fields that have any; their widths must fit.
     pub(crate) fn changes(&self) -> BTreeMap<&str, FieldChanges> {
         let mut fields: BTreeMap<&str, FieldChanges> = BTreeMap::new();
         for (index, row) in self.rows.iter().enumerate() {

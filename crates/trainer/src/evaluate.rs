@@ -1,4 +1,4 @@
-//! Scores of a model on views it was not trained on.
+//! Scores of a model on held-out views.
 
 use burn::tensor::{Device, Tensor};
 use serde::Serialize;
@@ -35,8 +35,9 @@ pub struct Scores {
     pub views: Vec<ViewScore>,
 }
 
-/// Renders every view and compares it with its photo. `each` gets every view with its picture,
-/// `H x W x 3` values clamped to [0, 1], for whoever keeps pictures.
+/// Renders every view and compares it with its photo. `each` receives every view with its image, `H
+/// x W x 3` values clamped to [0, 1], for callers that keep images. [`Trainer`](crate::Trainer) has
+/// an example.
 ///
 /// # Errors
 /// When an op refuses its input, or the device fails.
@@ -76,7 +77,7 @@ pub(crate) fn evaluate_with<M: SplatModel>(
     Ok(Scores::of_views(scores))
 }
 
-/// The picture of a view that is scored, clamped to [0, 1].
+/// The rendered image of a view, clamped to [0, 1].
 fn rendered<M: SplatModel>(
     model: &M,
     view: &View,
@@ -98,7 +99,7 @@ fn rendered<M: SplatModel>(
 }
 
 impl Scores {
-    /// The views with their means; NaN where there is no view.
+    /// Adds the means to scores of views; NaN if there are no views.
     pub fn of_views(views: Vec<ViewScore>) -> Self {
         let mean = |score: fn(&ViewScore) -> f64| {
             views.iter().map(score).sum::<f64>() / views.len() as f64

@@ -1,5 +1,5 @@
-//! Modules that ride along with a run: they change cameras, backgrounds or pictures, and have
-//! optimisers of their own.
+//! Modules trained beside the model, which change cameras, backgrounds or images and have their own
+//! optimisers.
 
 use std::any::Any;
 
@@ -12,20 +12,20 @@ use splat_ops::{OpError, Rendered};
 /// What a view is rendered for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
-    /// To be trained on.
+    /// Training.
     Training,
-    /// To be scored: nothing was learned about this view.
+    /// Scoring: nothing was learned about this view.
     HeldOut,
 }
 
 /// The view that a [`Hook`] is asked about.
 #[derive(Debug, Clone, Copy)]
 pub struct HookView<'a> {
-    /// Index among the views that are trained on; none of a view that is held out.
+    /// Index among the training views; `None` for a held-out view.
     pub training_index: Option<usize>,
     /// Name of its photo.
     pub name: &'a str,
-    /// What for.
+    /// What the view is rendered for.
     pub purpose: Purpose,
 }
 
@@ -57,22 +57,21 @@ pub struct HookView<'a> {
 /// }
 /// ```
 pub trait Hook: Any + Send {
-    /// What a checkpoint calls it; no two hooks of a run share a name.
+    /// Name in checkpoints, unique within a run.
     fn name(&self) -> &str;
 
     /// The cameras to render with.
     ///
     /// # Errors
-    /// As those of the ops that it uses.
+    /// Those of the ops used.
     fn cameras(&self, _view: &HookView, cameras: CameraTensors) -> Result<CameraTensors, OpError> {
         Ok(cameras)
     }
 
-    /// The colour behind the scene, `[C, 3]`, if this hook has one; the first hook that returns one
-    /// wins.
+    /// The background colour, `[C, 3]`, if this hook has one. The first hook that returns one wins.
     ///
     /// # Errors
-    /// As those of the ops that it uses.
+    /// Those of the ops used.
     fn background(
         &self,
         _view: &HookView,
@@ -81,23 +80,23 @@ pub trait Hook: Any + Send {
         Ok(None)
     }
 
-    /// The picture that is compared with the photo, see [`Rendered::with_image`].
+    /// The image compared with the photo, see [`Rendered::with_image`].
     ///
     /// # Errors
-    /// As those of the ops that it uses.
+    /// Those of the ops used.
     fn image(&self, _view: &HookView, rendered: Rendered) -> Result<Rendered, OpError> {
         Ok(rendered)
     }
 
-    /// Called after the backward pass: takes its gradients and steps.
+    /// Called after the backward pass, to take gradients and step.
     ///
     /// # Errors
-    /// As those of the ops that it uses.
+    /// Those of the ops used.
     fn step(&mut self, _gradients: &mut Gradients, _at: &StepInfo) -> Result<(), OpError> {
         Ok(())
     }
 
-    /// What a checkpoint must keep of it.
+    /// State to keep in a checkpoint.
     ///
     /// # Errors
     /// When the device fails.
@@ -105,10 +104,10 @@ pub trait Hook: Any + Send {
         Ok(StateRecord::default())
     }
 
-    /// Puts back what [`save`](Self::save) gave.
+    /// Restores the output of [`save`](Self::save).
     ///
     /// # Errors
-    /// What is wrong with it, in a line.
+    /// The problem, in one line.
     fn restore(&mut self, _record: StateRecord, _device: &Device) -> Result<(), String> {
         Ok(())
     }

@@ -8,8 +8,8 @@ pub fn photo(view: &View, device: &Device) -> Tensor<4> {
     values(pixels_u8(view, device))
 }
 
-/// The photo of a view as it is stored, 8 bits a value, `[1, H, W, 3]`: of type U8 where the device
-/// can compute with it.
+/// The photo of a view as stored, 8-bit levels `[1, H, W, 3]`, of type U8 if the device supports
+/// it.
 pub(crate) fn pixels_u8(view: &View, device: &Device) -> Tensor<4, Int> {
     let dtype = match device.supports_dtype(DType::U8) {
         true => DType::U8,
@@ -19,7 +19,7 @@ pub(crate) fn pixels_u8(view: &View, device: &Device) -> Tensor<4, Int> {
     Tensor::from_data(TensorData::new(view.image.to_vec(), shape), (device, dtype))
 }
 
-/// Levels from 0 to 255 as values in [0, 1].
+/// Converts levels from 0 to 255 to values in [0, 1].
 pub(crate) fn values(pixels: Tensor<4, Int>) -> Tensor<4> {
     pixels.float() / 255.0
 }

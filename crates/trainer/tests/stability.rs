@@ -1,5 +1,5 @@
 //! Deliberately bad starts: a run of 500 steps ends, every parameter stays finite, and a warning
-//! names what is wrong.
+//! names the problem.
 #![cfg(feature = "cpu")]
 
 use std::path::Path;
@@ -11,7 +11,7 @@ use rand_pcg::Pcg64Mcg;
 use splat_data::{Capture, CaptureSettings};
 use splat_trainer::{TrainSettings, Trained, Trainer, Warning};
 
-/// The training view that some of the tests spoil.
+/// The training view that some of the tests corrupt.
 const SPOILED: usize = 5;
 
 fn load(downscale: u32) -> Capture {
@@ -41,7 +41,7 @@ fn config() -> TrainSettings {
     }
 }
 
-/// Trains to the end, checks the parameters, and returns what was warned of.
+/// Trains to the end, checks the parameters, and returns the warnings.
 fn train(what: &str, capture: Capture, config: TrainSettings) -> Vec<Warning> {
     let heard = Arc::new(Mutex::new(Vec::new()));
     let hear = heard.clone();
@@ -90,8 +90,8 @@ fn assert_all_finite(trained: &Trained) {
     assert_eq!(losses.len(), trained.steps, "some losses were not finite");
 }
 
-/// Name of the spoiled view, and what becomes of its camera: the new world-to-camera matrix from
-/// the old.
+/// Changes the camera of a view, from its old world-to-camera matrix to a new one; returns the
+/// view's name.
 fn spoil_camera(
     capture: &mut Capture,
     change: impl Fn([[f64; 4]; 4]) -> [[f64; 4]; 4],
@@ -101,7 +101,7 @@ fn spoil_camera(
     vec![view.name.clone()]
 }
 
-/// The camera at another place, looking in the same direction.
+/// The camera at another position with the same orientation.
 fn moved(mut viewmat: [[f64; 4]; 4], to: [f64; 3]) -> [[f64; 4]; 4] {
     for row in &mut viewmat[..3] {
         row[3] = -(row[0] * to[0] + row[1] * to[1] + row[2] * to[2]);
@@ -112,7 +112,7 @@ fn moved(mut viewmat: [[f64; 4]; 4], to: [f64; 3]) -> [[f64; 4]; 4] {
 #[test]
 fn a_good_start_gives_no_warning() {
     assert_eq!(train("good", capture(), config()), []);
-    // As `splat train` has it, at a quarter of the size.
+    // As in `splat train`, at a quarter of the size.
     let config = TrainSettings {
         steps: 300,
         ..config()
@@ -194,7 +194,7 @@ fn a_camera_that_looks_away_is_named() {
     assert!(warnings.iter().any(found), "{warnings:?}");
 }
 
-/// A camera that sees the points as well as any other is found by its loss.
+/// A camera that sees the points as well as any other is detected by its loss.
 #[test]
 fn a_camera_upside_down_is_named() {
     let mut capture = capture();
@@ -246,8 +246,8 @@ fn high_learning_rates_are_named_with_their_factor() {
     }
 }
 
-/// Black points start at the clamp of colours at zero, behind which nothing learns. Colours take at
-/// most 7e-4 a step.
+/// Black points start at the clamp of colours at zero, below which nothing learns. Colours change
+/// by at most 7e-4 per step.
 #[test]
 fn black_points_learn_their_colours() {
     let mean_loss = |blacken: fn(usize) -> bool| {
@@ -268,8 +268,7 @@ fn black_points_learn_their_colours() {
             .run()
             .unwrap();
         let sh0 = trained.model.to_data().sh0;
-        // A channel that never got a gradient is where black begins: at level 0, or at half a
-        // level.
+        // A channel without any gradient stays where black starts: at level 0, or at half a level.
         let start = |level: f64| ((level / 255.0 - 0.5) / 0.282_094_791_773_878_14) as f32;
         let starts = [start(0.0), start(0.5)];
         let channels = sh0.iter().flatten();

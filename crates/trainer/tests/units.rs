@@ -1,4 +1,4 @@
-//! A capture has no unit: the same photos in another one give the same run.
+//! A capture has no unit: the same photos in another unit give the same run.
 #![cfg(feature = "cpu")]
 
 use std::path::Path;
@@ -9,10 +9,10 @@ use splat_data::{Capture, CaptureSettings, View};
 use splat_model::{CameraTensors, SceneScale, render};
 use splat_trainer::{TrainSettings, Trainer, evaluate};
 
-/// From a micrometre to a thousand kilometres, and two that are no powers of ten.
+/// From a micrometre to a thousand kilometres, including two that are not powers of ten.
 const UNITS: [f64; 6] = [1e-6, 0.002, 0.37, 25.4, 1e3, 1e6];
 
-/// The example capture at 118 x 79 pixels in a unit that is `1 / unit` times as large.
+/// The example capture at 118 x 79 pixels in a unit `1 / unit` times as large.
 fn capture(unit: f64) -> Arc<Capture> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
     let options = CaptureSettings {
@@ -53,8 +53,8 @@ fn relative(a: &[f32], b: &[f32], factor: f64) -> f64 {
     (error / size).sqrt()
 }
 
-/// The first render and its gradients, lengths in the capture's unit: name, values, and the power
-/// of the unit in them.
+/// The first render and its gradients, as name, values, and the power of the capture's unit in
+/// them.
 fn first_step(unit: f64) -> Vec<(&'static str, Vec<f32>, i32)> {
     fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f32> {
         tensor.into_data().try_into_vec().unwrap()
@@ -86,7 +86,7 @@ fn first_step(unit: f64) -> Vec<(&'static str, Vec<f32>, i32)> {
     ]
 }
 
-/// Rounding is all that differs, so that splats whose alpha is within it of a threshold may.
+/// Only rounding differs, so splats whose alpha is within rounding of a threshold may differ.
 #[test]
 fn the_first_render_and_its_gradients_are_the_same_in_any_unit() {
     let expected = first_step(1.0);
@@ -130,7 +130,7 @@ fn training_is_the_same_in_any_unit() {
     }
 }
 
-/// One camera of thirty that is 3,000 units out.
+/// One camera of thirty is 3,000 units out.
 #[test]
 fn one_camera_far_out_does_not_change_the_scale() {
     let mut capture = (*capture(1.0)).clone();

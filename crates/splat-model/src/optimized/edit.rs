@@ -1,4 +1,4 @@
-//! Edits of rows, of the values and the moments alike.
+//! Row edits of values and moments.
 
 use burn::module::Module;
 use burn::tensor::{Bool, Int, Tensor, TensorData};
@@ -11,12 +11,12 @@ use crate::optimizer::MomentEdit;
 use crate::rows::{FieldChanges, Moments, RowEdit};
 
 impl<M: Module> Optimized<M> {
-    /// Edits the rows of every field of a row set, and the moments with them: a gather per field on
+    /// Edits the rows of every field of a row set, with their moments, by one gather per field on
     /// the device. Parameters keep their ids.
     ///
     /// # Errors
-    /// When the edit names an old row, a row set or a field that there is not, has values of
-    /// another width, or leaves no Gaussian. Nothing is changed then.
+    /// When the edit names an old row, a row set or a field that does not exist, has values of the
+    /// wrong width, or leaves no Gaussian. The model is then unchanged.
     pub fn edit_rows(&mut self, edit: &RowEdit) -> Result<(), OpError> {
         self.check_edit(edit)?;
         self.edits += 1;
@@ -68,7 +68,7 @@ impl<M: Module> Optimized<M> {
         Ok(())
     }
 
-    /// Every row and width of an edit, before anything is changed.
+    /// Checks every row and width of an edit before anything changes.
     fn check_edit(&self, edit: &RowEdit) -> Result<(), OpError> {
         let wrong = |what: String| {
             Err(OpError::Argument {
@@ -113,7 +113,7 @@ impl<M: Module> Optimized<M> {
     }
 }
 
-/// Gathered rows with what the edit adds to them and puts in their place.
+/// Applies offsets and replacements to gathered rows.
 fn changed(value: Tensor<2>, changes: FieldChanges) -> Tensor<2> {
     let device = value.device();
     let [n, width] = value.dims();

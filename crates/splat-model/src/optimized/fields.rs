@@ -1,4 +1,5 @@
-//! The parameters that fields name: visited and changed as `[N, width]`, whatever their rank.
+//! Visitors and mappers of the parameters that fields name, as `[N, width]` tensors of any original
+//! rank.
 
 use std::collections::HashMap;
 
@@ -7,11 +8,11 @@ use burn::tensor::{Gradients, Tensor};
 
 use super::FieldGradients;
 
-/// `[N, ...]` as `[N, width]`.
+/// Reshapes `[N, ...]` to `[N, width]`.
 pub(super) fn flat<const D: usize>(value: Tensor<D>) -> Tensor<2> {
     let dims = value.dims();
     let width: usize = dims[1..].iter().product();
-    // Burn's reshape reads a zero as "keep this dimension".
+    // Burn's reshape interprets zero as "keep this dimension".
     value.reshape([dims[0], width])
 }
 
@@ -36,13 +37,13 @@ impl ModuleVisitor for Paths {
     }
 }
 
-/// What is done with a parameter of a field.
+/// A visitor of parameters that are fields.
 pub(super) trait VisitField {
     fn visit<const D: usize>(&mut self, name: &str, param: &Param<Tensor<D>>);
 }
 
 pub(super) struct FieldVisitor<V> {
-    /// Names of fields by path.
+    /// Field names by path.
     pub(super) names: HashMap<String, String>,
     pub(super) path: Vec<String>,
     pub(super) visit: V,
@@ -115,8 +116,8 @@ impl VisitField for GradientsOf<'_> {
     }
 }
 
-/// Maps the values of fields outside of the autodiff graph. While one is changed nothing else holds
-/// it, so that an optimiser can write into its memory.
+/// Maps the values of fields outside the autodiff graph. A value being changed has no other owner,
+/// so that an optimiser can write into its memory.
 pub(super) fn change<M: Module>(
     model: &mut Option<M>,
     names: HashMap<String, String>,

@@ -18,8 +18,7 @@ use crate::optimizer::{FieldOptimizer, MomentEdit, SplatAdam};
 use crate::{LearningRates, SplatModel};
 use fields::{FieldVisitor, GradientsOf, Paths, Untracked, ValuesOf, change};
 
-/// Gradients by the name of the field, each `[N, width]`: what is beyond the first dimension is
-/// flattened.
+/// Gradients by field name, each `[N, width]`; dimensions beyond the first are flattened.
 pub type FieldGradients = BTreeMap<String, Tensor<2>>;
 
 /// What the optimiser does with a field in a step.
@@ -27,9 +26,9 @@ pub type FieldGradients = BTreeMap<String, Tensor<2>>;
 pub enum FieldStep {
     /// A step, with the field's rate times this factor.
     Step(f64),
-    /// No step; the gradient is added to that of the next one.
+    /// No step; the gradient is added to the next one.
     Accumulate,
-    /// No step; the gradient is discarded, and so is what was accumulated.
+    /// No step; the gradient and any accumulated gradients are discarded.
     Skip,
 }
 
@@ -62,21 +61,21 @@ pub enum FieldStep {
 /// ```
 #[derive(Debug)]
 pub struct Optimized<M> {
-    /// Taken out while it is changed.
+    /// `None` while it is being changed.
     model: Option<M>,
     fields: Vec<Field>,
     optimizers: BTreeMap<String, FieldOptimizer>,
-    /// Gradients that wait for a step.
+    /// Accumulated gradients.
     waiting: FieldGradients,
-    /// Edits of rows so far.
+    /// Number of row edits so far.
     edits: usize,
 }
 
 impl<M: Module> Optimized<M> {
-    /// A model, with an optimiser for each of its fields.
+    /// A model with an optimiser for each of its fields.
     ///
     /// # Errors
-    /// When the model has no parameter of a field's path, or two fields share a name.
+    /// When the model has no parameter at a field's path, or two fields share a name.
     pub fn new(
         model: M,
         fields: Vec<Field>,
@@ -99,7 +98,7 @@ impl<M: Module> Optimized<M> {
     /// A model with [`SplatAdam`] for each of its fields, stepping `rows`.
     ///
     /// # Errors
-    /// As those of [`new`](Self::new).
+    /// Those of [`new`](Self::new).
     pub fn with_adam(
         model: M,
         rates: &LearningRates,
@@ -115,11 +114,11 @@ impl<M: Module> Optimized<M> {
         })
     }
 
-    /// A module whose float parameters are all trained with one learning rate, and have no row per
-    /// Gaussian: what rides along with a model.
+    /// A module whose float parameters all train at one learning rate and have no rows, for modules
+    /// trained beside a model.
     ///
     /// # Errors
-    /// As those of [`new`](Self::new).
+    /// Those of [`new`](Self::new).
     pub fn of_module(
         module: M,
         rate: f64,
@@ -197,7 +196,7 @@ impl<M: Module> Optimized<M> {
         self.model.as_ref().expect(WHOLE)
     }
 
-    /// How often rows were edited: gradients of before an edit belong to other rows.
+    /// Number of row edits so far. Gradients from before an edit belong to other rows.
     pub fn edits(&self) -> usize {
         self.edits
     }
@@ -207,12 +206,12 @@ impl<M: Module> Optimized<M> {
         self.model.expect(WHOLE)
     }
 
-    /// The fields that are trained.
+    /// The trained fields.
     pub fn fields(&self) -> &[Field] {
         &self.fields
     }
 
-    /// The value of a field, `[N, width]`, outside of the autodiff graph.
+    /// Value of a field, `[N, width]`, outside the autodiff graph.
     pub fn field(&self, name: &str) -> Option<Tensor<2>> {
         let mut found = None;
         self.visit(|field, value| {
@@ -223,7 +222,7 @@ impl<M: Module> Optimized<M> {
         found
     }
 
-    /// The values of fields on the host, each `[N][width]` flattened, in one transfer.
+    /// Values of fields on the host, each `[N][width]` flattened, in one transfer.
     ///
     /// # Errors
     /// When the model has no such field, or the device fails.
@@ -257,7 +256,7 @@ impl<M: Module> Optimized<M> {
         }))
     }
 
-    /// Takes the gradients of the fields out of those of a backward pass.
+    /// Takes the gradients of the fields from those of a backward pass.
     pub fn gradients(&self, gradients: &mut Gradients) -> FieldGradients {
         let mut taken = FieldGradients::new();
         let mut visitor = FieldVisitor::new(
@@ -271,10 +270,10 @@ impl<M: Module> Optimized<M> {
         taken
     }
 
-    /// Steps every field that has a gradient, as `how` says: its rate, and what is to be done.
+    /// Steps every field that has a gradient. `how` returns its rate and what to do.
     ///
     /// # Errors
-    /// When a gradient has not the shape of its field; no field has taken a step then.
+    /// When the shape of a gradient differs from its field's. No field has been stepped then.
     pub fn step(
         &mut self,
         mut gradients: FieldGradients,
@@ -332,11 +331,12 @@ impl<M: Module> Optimized<M> {
         }
     }
 
-    /// Replaces the value `[N, width]` of a field by another of its shape, and leaves its moments.
+    /// Replaces the value `[N, width]` of a field by another of the same shape, keeping its
+    /// moments.
     ///
     /// # Errors
-    /// When the model has no such field, or the new value another shape; the field is then as it
-    /// was.
+    /// When the model has no such field, or the new value has another shape. The field is then
+    /// unchanged.
     pub fn update(
         &mut self,
         field: &str,
@@ -355,7 +355,7 @@ impl<M: Module> Optimized<M> {
         Ok(())
     }
 
-    /// Lets all moments of a field start anew.
+    /// Resets all moments of a field.
     pub fn restart_moments(&mut self, field: &str) {
         if let Some(optimizer) = self.optimizers.get_mut(field) {
             optimizer.edit_rows(&MomentEdit::Restart);
@@ -363,8 +363,8 @@ impl<M: Module> Optimized<M> {
         self.waiting.remove(field);
     }
 
-    /// Lowers every opacity to at most `opacity` and lets the moments of the logits start anew (the
-    /// opacity reset of 3DGS section 5.2).
+    /// Lowers every opacity to at most `opacity` and resets the moments of the logits (the opacity
+    /// reset of 3DGS section 5.2).
     ///
     /// # Errors
     /// When the model has no opacity logits.
@@ -383,7 +383,7 @@ impl<M: Module> Optimized<M> {
         shapes
     }
 
-    /// Names of the float parameters that are no fields, by path.
+    /// Names of the float parameters that are not fields, by path.
     fn other_names(&self) -> HashMap<String, String> {
         let mut paths = Paths::default();
         self.model().visit(&mut paths);
@@ -410,6 +410,6 @@ impl<M: Module> Optimized<M> {
     }
 }
 
-/// Under this name parameters that are no fields are saved.
+/// Prefix under which parameters that are not fields are saved.
 const FIXED: &str = "fixed";
 const WHOLE: &str = "the model is put back after every change";

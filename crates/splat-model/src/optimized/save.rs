@@ -1,4 +1,4 @@
-//! Values and moments on their way to a checkpoint and back.
+//! Saving and restoring of values and moments.
 
 use std::collections::BTreeMap;
 
@@ -10,13 +10,13 @@ use super::Optimized;
 use super::fields::{FieldVisitor, ValuesOf, change};
 use crate::optimizer::StateRecord;
 
-/// Name of a gradient that waits for a step, beside the moments.
+/// Name of an accumulated gradient, beside the moments.
 const WAITING: &str = "waiting_gradient";
 
 impl<M: Module> Optimized<M> {
     /// Values and optimiser states of all fields, on the host: value `means` is tensor `means`, a
-    /// moment of it `means.moment_1`. Values are `[N, width]`. Parameters that are no fields are
-    /// kept too, under `fixed/`.
+    /// moment of it `means.moment_1`. Values are `[N, width]`. Parameters that are not fields are
+    /// included under `fixed/`.
     ///
     /// # Errors
     /// When the device fails.
@@ -48,12 +48,12 @@ impl<M: Module> Optimized<M> {
         Ok(record)
     }
 
-    /// Puts back what [`save`](Self::save) gave, with any number of rows. Parameters keep their
+    /// Restores the output of [`save`](Self::save), with any number of rows. Parameters keep their
     /// ids.
     ///
     /// # Errors
-    /// What does not fit the model or its optimisers, naming the field. The model is as it was
-    /// then; optimisers may have been restored.
+    /// A mismatch with the model or its optimisers, naming the field. The model is then unchanged;
+    /// optimisers may have been restored.
     pub fn restore(&mut self, record: StateRecord, device: &Device) -> Result<(), String> {
         let mut fields = record.by_field();
         let shapes = self.shapes();
@@ -113,8 +113,7 @@ impl<M: Module> Optimized<M> {
         Ok(())
     }
 
-    /// The parameters that are no fields, taken out of a record: all of them, and of the model's
-    /// shapes.
+    /// Takes the parameters that are not fields from a record: all of them, in the model's shapes.
     fn restore_fixed(
         &self,
         fields: &mut BTreeMap<String, (Option<TensorData>, StateRecord)>,

@@ -1,4 +1,4 @@
-//! A model of two row sets, a shared parameter and one that is not trained, edited and stepped.
+//! Tests with a model of two row sets, a shared parameter, and one that is not trained.
 
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -97,7 +97,7 @@ fn an_edit_touches_its_row_set_and_nothing_else() {
     let moment = saved.tensors["means.moment_1"].try_to_vec::<f32>().unwrap();
     assert!(moment[0] != 0.0 && moment[2..] == [0.0, 0.0], "{moment:?}");
 
-    // The other set, and its moments, with rows of another shape.
+    // The other set and its moments, with rows of another shape.
     let mut edit = RowEdit::of_row_set(1);
     edit.push(1, Moments::Keep);
     optimized.edit_rows(&edit).unwrap();
@@ -149,7 +149,7 @@ fn fields_that_the_model_does_not_have_are_named() {
     assert!(refused(&|fields| fields[3].name = "a.b".into()).contains("dot"));
 }
 
-/// Two steps that wait and one that does not are one step along the sum of three gradients.
+/// Two accumulated gradients and a step equal one step along the sum of three gradients.
 #[test]
 fn gradients_that_wait_are_added_up() {
     let device = Device::flex().autodiff();
@@ -157,7 +157,7 @@ fn gradients_that_wait_are_added_up() {
     step(&mut waiting, FieldStep::Accumulate);
     step(&mut waiting, FieldStep::Accumulate);
     assert_eq!(values(&waiting.model().gain), [0.0, 1.0, 2.0, 3.0]);
-    // Saved and put back, it still waits.
+    // The accumulated gradient survives saving and restoring.
     let saved = waiting.save().unwrap();
     let mut restored = optimized(&device);
     restored
@@ -251,7 +251,7 @@ fn values_and_gradients_of_another_shape_are_refused() {
     assert_eq!(values(&optimized.model().gain), [0.0, 2.0, 4.0, 6.0]);
 }
 
-/// Every change is as wide as its field, and not only all of them together.
+/// The width of every change is checked individually, not only their sum.
 #[test]
 fn changes_of_another_width_are_named_by_row() {
     let device = Device::flex().autodiff();
@@ -278,7 +278,7 @@ fn changes_of_another_width_are_named_by_row() {
     assert!(message.contains("no row set 7"), "{message}");
 }
 
-/// What waits in the old model does not reach the restored one.
+/// Gradients accumulated in the old model do not reach the restored one.
 #[test]
 fn waiting_gradients_are_those_of_the_restored_state() {
     let device = Device::flex().autodiff();
@@ -298,7 +298,7 @@ fn waiting_gradients_are_those_of_the_restored_state() {
     assert_eq!(moments(&waiting), moments(&fresh));
 }
 
-/// Parameters that are no fields are part of the state too.
+/// Parameters that are not fields are part of the state too.
 #[test]
 fn parameters_that_are_no_fields_are_saved() {
     let device = Device::flex().autodiff();
@@ -311,7 +311,7 @@ fn parameters_that_are_no_fields_are_saved() {
     assert_eq!(values(&second.model().fixed), values(&first.model().fixed));
 }
 
-/// Nothing would be learned of what autodiff does not know.
+/// A parameter that autodiff does not track would learn nothing.
 #[test]
 fn a_module_that_autodiff_does_not_track_is_refused() {
     let device = Device::flex();

@@ -8,11 +8,10 @@ use splat_ops::{AdamRows, AdamStep, adam_step};
 use super::edit::{MomentEdit, RowOptimizer};
 use crate::Field;
 
-/// Adam for one field of the Gaussians.
+/// Adam for one field of a model.
 ///
-/// A gradient whose square is not finite counts as zero, element by element: as if the view had not
-/// seen that Gaussian. Once in the moments it would stay there and make the parameter NaN, or stop
-/// it for good.
+/// A gradient entry whose square is not finite counts as zero, as if the view had not seen that
+/// Gaussian. In the moments it would persist and make the parameter NaN, or freeze it.
 #[derive(Debug, Clone)]
 pub struct SplatAdam {
     /// Decay of the first moment.
@@ -21,7 +20,7 @@ pub struct SplatAdam {
     pub beta_2: f64,
     /// Added to the root of the second moment.
     pub epsilon: f64,
-    /// Which rows take a step. [`AdamRows::Seen`] is another optimiser with other results: measure
+    /// Rows that take a step. [`AdamRows::Seen`] is another optimiser with other results; measure
     /// before relying on it.
     pub rows: AdamRows,
 }
@@ -43,8 +42,8 @@ impl SplatAdam {
         }
     }
 
-    /// The settings for a field, stepping `rows`: where its values are lengths, epsilon, one over a
-    /// length, follows the size of the scene.
+    /// Settings for a field, stepping `rows`. If the field's values are lengths, epsilon (one over
+    /// a length) follows the size of the scene.
     pub fn of_field(field: &Field, rows: AdamRows, scene: SceneScale) -> Self {
         let mut adam = Self::new();
         adam.rows = rows;
@@ -66,7 +65,7 @@ pub struct SplatAdamState<const D: usize> {
     pub moment_2: Tensor<D>,
 }
 
-// By hand: the derive names crates that only Burn itself depends on.
+// Implemented by hand, as the derive names crates that only Burn depends on.
 impl<const D: usize> RecordState for SplatAdamState<D> {
     fn state_flatten(&self, prefix: &str, out: &mut StateSink) {
         out.push_scalar(prefix, "time", self.time.into());
@@ -172,8 +171,7 @@ mod tests {
         }
     }
 
-    /// Rows that a step has not seen are as if it had not been, but for the count of steps; the
-    /// others are as ever.
+    /// Unseen rows are unaffected by a step, except for the step count; seen rows step as usual.
     #[test]
     fn of_seen_rows_only_the_others_keep_everything() {
         let device = Device::flex();
@@ -190,7 +188,7 @@ mod tests {
             [values(state.moment_1), values(state.moment_2)]
         };
         let before = (values(first.clone()), moments(&state));
-        // Nothing, one element of two, and nothing but a NaN.
+        // No gradient, one of two elements, and only NaN.
         let gradient = Tensor::from_floats([[0.0, 0.0], [0.0, 0.3], [0.0, f32::NAN]], &device);
         let (seen, seen_state) = adam.step(0.01, first.clone(), gradient.clone(), state.clone());
         let (every, every_state) = all.step(0.01, first, gradient, state);

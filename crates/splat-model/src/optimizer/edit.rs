@@ -1,22 +1,22 @@
-//! Edits of moments, on the device, for the optimisers of the Adam family.
+//! Edits of moments on the device, for optimisers of the Adam family.
 
 use burn::optim::{Adam, AdamState, AdamW, AdamWState, AdaptiveMomentumState, Optimizer};
 use burn::tensor::{Bool, Int, Tensor};
 
 use super::state_record::StateRecord;
 
-/// What an edit of rows does to a moment.
+/// The effect of a row edit on a moment.
 #[derive(Debug, Clone)]
 #[expect(clippy::large_enum_variant, reason = "a handful exist at a time")]
 pub enum MomentEdit {
-    /// Row i continues row `source[i]`, or starts anew where `restarts[i]`.
+    /// Row i continues row `source[i]`, or restarts if `restarts[i]`.
     Gather {
         /// `[N_new]`, indices into the old rows.
         source: Tensor<1, Int>,
         /// `[N_new]`.
         restarts: Tensor<1, Bool>,
     },
-    /// All rows start anew.
+    /// All rows restart.
     Restart,
 }
 
@@ -27,7 +27,7 @@ impl MomentEdit {
             Self::Gather { source, restarts } => {
                 let [_, width] = moment.dims();
                 let moment = moment.select(0, source.clone());
-                // Filled, not multiplied by zero, which would leave a NaN.
+                // Filled rather than multiplied by zero, which would keep NaN.
                 let restarts = restarts.clone().unsqueeze_dim::<2>(1).repeat_dim(1, width);
                 moment.mask_fill(restarts, 0.0)
             }
@@ -36,17 +36,17 @@ impl MomentEdit {
     }
 }
 
-/// A Burn optimiser whose state can follow edits of rows. [`ThroughHost`](super::ThroughHost) makes
-/// one of any other.
+/// A Burn optimiser whose state can follow row edits. [`ThroughHost`](super::ThroughHost) turns any
+/// other optimiser into one.
 pub trait RowOptimizer: Optimizer {
-    /// The state of a parameter `[N, width]` after an edit of its rows.
+    /// State of a parameter `[N, width]` after an edit of its rows.
     fn edit_rows(state: Self::State<2>, edit: &MomentEdit) -> Self::State<2>;
 
-    /// Checks a saved state of a parameter of this shape before it is put together. Here every
-    /// tensor must have the parameter's shape.
+    /// Checks a saved state against the shape of its parameter before it is loaded. By default
+    /// every tensor must have that shape.
     ///
     /// # Errors
-    /// What does not fit, in a line.
+    /// The mismatch, in one line.
     fn check_state(record: &StateRecord, shape: [usize; 2]) -> Result<(), String> {
         match record
             .tensors

@@ -6,7 +6,7 @@ use burn::tensor::{Device, Tensor};
 use super::edit::{MomentEdit, RowOptimizer};
 use super::state_record::StateRecord;
 
-/// Steps one field and edits its moments: a [`RowOptimizer`] and its state, without their types.
+/// Steps one field and edits its moments: a type-erased [`RowOptimizer`] with its state.
 pub struct FieldOptimizer(Box<dyn Erased>);
 
 impl core::fmt::Debug for FieldOptimizer {
@@ -25,25 +25,25 @@ impl<O: RowOptimizer> From<O> for FieldOptimizer {
 }
 
 impl FieldOptimizer {
-    /// The value `[N, width]` after a step along the gradient of the same shape.
+    /// Value `[N, width]` after a step along the gradient of the same shape.
     pub fn step(&mut self, rate: f64, value: Tensor<2>, gradient: Tensor<2>) -> Tensor<2> {
         self.0.step(rate, value, gradient)
     }
 
-    /// Lets the moments follow an edit of rows.
+    /// Applies a row edit to the moments.
     pub fn edit_rows(&mut self, edit: &MomentEdit) {
         self.0.edit_rows(edit);
     }
 
-    /// The state, on the host; empty before the first step.
+    /// The state on the host; empty before the first step.
     pub fn save(&self) -> StateRecord {
         self.0.save()
     }
 
-    /// Puts back what [`save`](Self::save) gave, for a value of this shape.
+    /// Restores the output of [`save`](Self::save), for a value of this shape.
     ///
     /// # Errors
-    /// What is missing, where it is another optimiser's.
+    /// The missing entries, if the state belongs to another optimiser.
     pub fn restore(
         &mut self,
         record: StateRecord,

@@ -1,9 +1,9 @@
 //! Optimisers whose moments follow the rows of a parameter when a strategy adds, removes or
 //! reorders them.
 //!
-//! A [`FieldOptimizer`] owns the state of one field. Fields are stepped as `[N, width]` tensors
-//! whatever their rank, which costs nothing (a reshape is no copy) and changes no number of an
-//! element-wise optimiser.
+//! A [`FieldOptimizer`] owns the state of one field. Fields are stepped as `[N, width]` tensors of
+//! any original rank; the reshape copies nothing, and changes no result of an elementwise
+//! optimiser.
 
 mod adam;
 mod edit;

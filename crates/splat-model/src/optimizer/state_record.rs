@@ -1,11 +1,11 @@
-//! State as tensors and numbers by name, on its way to a checkpoint and back.
+//! State as named tensors and numbers, for checkpoints.
 
 use std::collections::BTreeMap;
 
 use burn::tensor::TensorData;
 use burn_pack::Scalar;
 
-/// State that a run saves and goes on from: of an optimiser, a strategy, a module.
+/// Saved state of an optimiser, a strategy or a module.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct StateRecord {
     /// Tensors by name.
@@ -15,8 +15,8 @@ pub struct StateRecord {
 }
 
 impl StateRecord {
-    /// The entries of each name before the first dot: the tensor of that name alone, and what is
-    /// under it.
+    /// Splits the entries by the part of the name before the first dot: the tensor of that name
+    /// alone, and the entries under it.
     pub(crate) fn by_field(self) -> BTreeMap<String, (Option<TensorData>, StateRecord)> {
         let mut fields: BTreeMap<String, (Option<TensorData>, Self)> = BTreeMap::new();
         for (name, data) in self.tensors {
@@ -36,7 +36,7 @@ impl StateRecord {
         fields
     }
 
-    /// Takes out everything under a name, which is cut from it: `model.means` under `model` is
+    /// Takes out everything under a name and strips the name: `model.means` under `model` becomes
     /// `means`.
     pub fn take_under(&mut self, name: &str) -> Self {
         let is_under = |key: &str| {
@@ -64,8 +64,7 @@ impl StateRecord {
         under
     }
 
-    /// Puts everything of another record under a name, which [`take_under`](Self::take_under) takes
-    /// out again.
+    /// Puts everything of another record under a name, for [`take_under`](Self::take_under).
     pub fn put_under(&mut self, name: &str, other: Self) {
         let under = |key: String| format!("{name}.{key}");
         self.tensors.extend(

@@ -1,4 +1,4 @@
-//! Moments belong to the rows beside them, whatever the optimiser.
+//! Moments follow their rows, with every optimiser.
 
 use burn::optim::momentum::MomentumConfig;
 use burn::optim::{AdamConfig, AdamWConfig, RmsPropConfig, SgdConfig};
@@ -8,7 +8,7 @@ use super::*;
 
 type Named = (&'static str, FieldOptimizer);
 
-/// Those whose moments stay on the device, and others.
+/// Optimisers whose moments stay on the device, and others.
 fn optimizers() -> Vec<Named> {
     let momentum = MomentumConfig::new().with_momentum(0.8);
     vec![
@@ -38,13 +38,13 @@ fn values(tensor: Tensor<2>) -> Vec<f32> {
     tensor.into_data().try_into_vec().unwrap()
 }
 
-/// The gradient of row `row` of the first model at a step.
+/// Gradient of row `row` of the first model at a step.
 fn gradient(row: usize, step: usize) -> [f32; 2] {
     let phase = row as f32 * 1.7 + step as f32;
     [phase.sin(), 10.0 * phase.cos()]
 }
 
-/// Steps rows that were once rows `rows` of the first model.
+/// Steps rows that were rows `rows` of the first model.
 fn step(
     optimizer: &mut FieldOptimizer,
     value: Tensor<2>,
@@ -68,7 +68,7 @@ fn gather(source: &[i32], restarts: &[bool], device: &Device) -> MomentEdit {
     }
 }
 
-/// Rows that were edited are trained as if they had been where they are from the beginning.
+/// After an edit, rows train as if they had always been in their new positions.
 #[test]
 fn moments_follow_their_rows() {
     let device = Device::flex();
@@ -106,7 +106,7 @@ fn rows_that_start_anew_have_no_moments() {
     assert_eq!((after, value.dims()), (vec![0.0; 6], [3, 2]));
 }
 
-/// What was saved goes on with the same numbers.
+/// A restored state continues with the same numbers.
 #[test]
 fn a_state_that_was_saved_goes_on() {
     let device = Device::flex();
@@ -150,7 +150,7 @@ fn records_are_put_under_names_and_taken_out_again() {
     assert_eq!(record.scalars.keys().collect::<Vec<_>>(), ["models.time"]);
 }
 
-/// A row that starts anew has zeros, whatever its moments were.
+/// A restarted row has zero moments, whatever they were.
 #[test]
 fn a_moment_that_is_not_a_number_does_not_survive_a_restart() {
     let device = Device::flex();

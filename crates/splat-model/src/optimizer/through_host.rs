@@ -1,4 +1,4 @@
-//! Any Burn optimiser, its state edited on the host.
+//! Any Burn optimiser, with its state edited on the host.
 
 use burn::optim::{LearningRate, Optimizer, RecordState, StateSink, StateSource};
 use burn::tensor::{Device, Tensor, TensorData};
@@ -6,11 +6,10 @@ use burn::tensor::{Device, Tensor, TensorData};
 use super::edit::{MomentEdit, RowOptimizer};
 use super::state_record::StateRecord;
 
-/// Makes a [`RowOptimizer`] of any Burn optimiser: on an edit its state is read back, and every
-/// tensor with one row per row of the parameter is edited and sent to the device again. That is
-/// twice the size of the state per edit, with a wait for the device; for one edit in a hundred
-/// steps about 1 % of what the steps themselves move. A state that cannot be put together again
-/// starts anew.
+/// Turns any Burn optimiser into a [`RowOptimizer`]. An edit reads the state back, edits every
+/// tensor that has one row per parameter row, and uploads it again. That transfers twice the size
+/// of the state per edit and waits for the device; at one edit per hundred steps, about 1 % of the
+/// traffic of the steps. A state that cannot be reassembled restarts.
 #[derive(Debug, Clone)]
 pub struct ThroughHost<O>(pub O);
 
@@ -40,7 +39,7 @@ impl<O: Optimizer> Optimizer for ThroughHost<O> {
     }
 }
 
-/// A state, and the number of rows of its parameter.
+/// A state, with the number of rows of its parameter.
 #[derive(Debug, Clone)]
 pub struct HostState<S> {
     rows: usize,
@@ -58,7 +57,7 @@ impl<S: RecordState + Clone> RecordState for HostState<S> {
     fn state_unflatten(prefix: &str, src: &mut StateSource, device: &Device) -> Option<Self> {
         let rows = usize::try_from(src.take_scalar(prefix, "rows")?).ok()?;
         let inner = burn::optim::join_path(prefix, "inner");
-        // What there is must be a state of this optimiser.
+        // An existing state must be one of this optimiser.
         let has_state = src.has_under(&inner);
         let inner = S::state_unflatten(&inner, src, device);
         (inner.is_some() || !has_state).then_some(Self { rows, inner })
@@ -66,7 +65,7 @@ impl<S: RecordState + Clone> RecordState for HostState<S> {
 }
 
 impl<O: Optimizer> RowOptimizer for ThroughHost<O> {
-    /// What a state looks like is the optimiser's own business.
+    /// The layout of a state is known only to the optimiser.
     fn check_state(_: &StateRecord, _: [usize; 2]) -> Result<(), String> {
         Ok(())
     }
@@ -79,7 +78,7 @@ impl<O: Optimizer> RowOptimizer for ThroughHost<O> {
             MomentEdit::Gather { source, .. } => (source.dims()[0], Some(source.device())),
             MomentEdit::Restart => (state.rows, None),
         };
-        // To start anew is to forget the state.
+        // Restarting means dropping the state.
         let Some(device) = device else {
             return HostState { rows, inner: None };
         };
@@ -96,7 +95,7 @@ impl<O: Optimizer> RowOptimizer for ThroughHost<O> {
     }
 }
 
-/// The tensor after the edit, where it has one row per row of the parameter.
+/// The tensor after the edit, if it has one row per parameter row.
 fn edited(data: TensorData, rows: usize, edit: &MomentEdit, device: &Device) -> TensorData {
     let mut shape = data.shape().to_vec();
     if shape.first() != Some(&rows) || rows == 0 || !data.dtype().is_float() {

@@ -1,9 +1,9 @@
-//! The whole state of a run in one safetensors file: the model with the moments of its optimisers,
-//! what the strategy and the hooks keep, how far it got, its settings, and what tells its capture
-//! from another. A resumed run goes on with the same numbers, or not at all.
+//! The whole state of a run in one safetensors file: the model with its optimisers' moments, the
+//! state of strategy and hooks, the progress, the settings, and a fingerprint of the capture. A
+//! resumed run continues with exactly the same numbers, or not at all.
 //!
-//! Tensors are named by what they belong to: `model.means` is a parameter, `[N, width]`,
-//! `model.means.moment_1` a moment of it, `strategy.gradients` what density control has summed up,
+//! Tensor names begin with their owner: `model.means` is a parameter, `[N, width]`,
+//! `model.means.moment_1` a moment of it, `strategy.gradients` a sum of density control,
 //! `hook.exposure.gain` a parameter of the hook `exposure`.
 
 mod check;
@@ -30,10 +30,10 @@ pub(super) use run::RunRecord;
 
 /// File format version; a reader refuses others.
 const VERSION: u32 = 4;
-/// Key of the metadata entry that holds everything but tensors.
+/// Key of the metadata entry for everything except tensors.
 const META: &str = "burn_splat";
-/// Key of the metadata entry with the checksum of everything else: a number that the disk lost
-/// would go on silently.
+/// Key of the metadata entry with the checksum of everything else, so that corruption on disk is
+/// noticed.
 const CHECKSUM: &str = "burn_splat_checksum";
 
 /// Name, shape and values.
@@ -47,7 +47,7 @@ pub struct Checkpoint {
     tensors: Vec<SavedTensor>,
 }
 
-/// A number as JSON keeps it to the last bit, whatever it is.
+/// A number that JSON preserves to the last bit.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 enum SavedScalar {
     Int(i64),
@@ -78,7 +78,7 @@ impl From<SavedScalar> for Scalar {
     }
 }
 
-/// The part of [`Meta`] that all versions have.
+/// The part of [`Meta`] common to all versions.
 #[derive(Deserialize)]
 struct Versioned {
     version: u32,
@@ -90,7 +90,7 @@ struct Meta {
     step: usize,
     run: RunRecord,
     elapsed_seconds: f64,
-    /// As bits, which JSON does not round.
+    /// As bits, since JSON would round.
     origin_bits: [u64; 3],
     /// Name of the strategy.
     strategy: String,
@@ -98,13 +98,13 @@ struct Meta {
     hooks: Vec<String>,
     /// Number of Gaussians.
     gaussians: usize,
-    /// Numbers of optimisers, strategy and hooks, named as tensors are.
+    /// Numbers of optimisers, strategy and hooks, named like tensors.
     scalars: BTreeMap<String, SavedScalar>,
     history: History,
 }
 
 impl Checkpoint {
-    /// The state of a run.
+    /// The current state of a run.
     pub(super) fn of<M: SplatModel>(
         state: &State<M>,
         run: &RunRecord,
@@ -155,23 +155,23 @@ impl Checkpoint {
         self.meta.gaussians
     }
 
-    /// Where in the world the means count from.
+    /// Origin of the means in the world.
     pub(super) fn origin(&self) -> [f64; 3] {
         self.meta.origin_bits.map(f64::from_bits)
     }
 
-    /// Writes the file beside its place and renames it, so that a crash, of the machine too, leaves
-    /// the old one or the new one.
+    /// Writes a temporary file and renames it, so that a crash, even of the machine, leaves the old
+    /// file or the new one.
     ///
     /// # Errors
-    /// When the disk refuses.
+    /// When the file cannot be written.
     pub fn save(&self, path: impl AsRef<Path>) -> Result<(), CheckpointError> {
         let path = path.as_ref();
         let format = |reason: String| CheckpointError::Format {
             path: path.to_path_buf(),
             reason,
         };
-        // What could not be read again must not replace what can.
+        // A state that could not be read again must not replace one that can.
         check::tensors(&self.tensors)
             .and_then(|()| check::meta(&self.meta))
             .map_err(|reason| format(format!("the run has left all bounds: {reason}")))?;
@@ -203,10 +203,10 @@ impl Checkpoint {
         })
     }
 
-    /// Reads a file that [`save`](Self::save) wrote.
+    /// Reads a file written by [`save`](Self::save).
     ///
     /// # Errors
-    /// When it cannot be read or is not such a file.
+    /// When the file cannot be read or is not a checkpoint.
     pub fn load(path: impl AsRef<Path>) -> Result<Self, CheckpointError> {
         let path = path.as_ref();
         let bytes = std::fs::read(path).map_err(|source| CheckpointError::Io {
@@ -216,10 +216,10 @@ impl Checkpoint {
         Self::parse(path, &bytes)
     }
 
-    /// [`load`](Self::load) on the content of a file; `path` is for messages.
+    /// [`load`](Self::load) from the contents of a file; `path` is used in messages.
     ///
     /// # Errors
-    /// When it is not such a file, or its parts do not fit together.
+    /// When the file is not a checkpoint, or its parts are inconsistent.
     pub fn parse(path: &Path, bytes: &[u8]) -> Result<Self, CheckpointError> {
         let format = |reason: String| CheckpointError::Format {
             path: path.to_path_buf(),
@@ -269,7 +269,7 @@ impl Checkpoint {
         })
     }
 
-    /// Puts a run back to where it was.
+    /// Restores the state of a run.
     pub(super) fn restore<M: SplatModel>(
         self,
         state: &mut State<M>,
@@ -296,7 +296,7 @@ impl Checkpoint {
     }
 }
 
-/// The checksum that a file must have to be what was saved; none of what is no checkpoint.
+/// Checksum that a file with these contents must carry; `None` if it is not a checkpoint.
 pub fn expected_checksum(bytes: &[u8]) -> Option<String> {
     let (_, header) = SafeTensors::read_metadata(bytes).ok()?;
     let meta = header.metadata().as_ref()?.get(META)?;
@@ -308,8 +308,7 @@ fn checksum_of(meta: &str, file: &SafeTensors) -> String {
     checksum(meta, contents.collect())
 }
 
-/// Checksum of a file's contents: the metadata, then each tensor's name and bytes in the order of
-/// the names.
+/// Checksum of a file's contents: the metadata, then each tensor's name and bytes, sorted by name.
 fn checksum(meta: &str, mut contents: Vec<(&str, &[u8])>) -> String {
     contents.sort_unstable_by_key(|(name, _)| *name);
     let mut hasher = crc32fast::Hasher::new();

@@ -1,4 +1,4 @@
-//! Commands to a run from another thread, between its steps.
+//! Commands to a run from another thread, executed between steps.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, TryRecvError, channel};
@@ -6,42 +6,42 @@ use std::time::Duration;
 
 use splat_data::SplatData;
 
-/// How often a paused run looks whether it was interrupted.
+/// Interval at which a paused run checks for interruption.
 const PAUSED_POLL: Duration = Duration::from_millis(50);
 
-/// What a run can be told between its steps.
+/// A command to a run, executed between steps.
 #[derive(Debug)]
 pub enum Command {
-    /// Wait before the next step.
+    /// Waits before the next step.
     Pause,
-    /// Go on.
+    /// Continues.
     Resume,
-    /// Take one step, and wait again.
+    /// Takes one step, then waits again.
     Step,
-    /// Keep a checkpoint now, where checkpoints are kept.
+    /// Writes a checkpoint now, to the usual place.
     Save,
-    /// End after this step, as an interrupt does.
+    /// Ends after this step, like an interrupt.
     Stop,
-    /// Send the scene as it is.
+    /// Sends the current scene.
     Snapshot(Sender<Snapshot>),
 }
 
-/// A scene in the middle of a run.
+/// The scene of a running training.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Snapshot {
     /// Steps done.
     pub step: usize,
-    /// The scene, with the settings that it is rendered with.
+    /// The scene, with its render settings.
     pub scene: SplatData,
 }
 
-/// Where commands to a run are put: one end for whoever watches, the other for
+/// A channel for commands: the sender for the controlling thread, the receiver for
 /// [`TrainerBuilder::commands`](super::TrainerBuilder::commands).
 pub fn command_queue() -> (Sender<Command>, Receiver<Command>) {
     channel()
 }
 
-/// What the run is to do now.
+/// The next action of a run.
 pub(super) enum Next {
     Step,
     Stop,
@@ -49,7 +49,7 @@ pub(super) enum Next {
     Snapshot(Sender<Snapshot>),
 }
 
-/// The receiving end, and whether the run waits.
+/// The receiver, and whether the run is paused.
 pub(super) struct Commands {
     receiver: Option<Receiver<Command>>,
     paused: bool,
@@ -63,8 +63,7 @@ impl Commands {
         }
     }
 
-    /// The next thing to do, waiting for it while the run is paused. A queue whose other end is
-    /// gone commands nothing: the run goes on.
+    /// The next action, waiting for it while paused. If all senders are gone, the run continues.
     pub(super) fn next(&mut self, interrupt: &AtomicBool) -> Next {
         loop {
             if interrupt.load(Ordering::Relaxed) {

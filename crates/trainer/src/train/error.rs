@@ -1,4 +1,4 @@
-//! Why a run cannot begin or go on.
+//! Errors of training runs.
 
 use std::path::PathBuf;
 
@@ -8,7 +8,7 @@ use splat_ops::OpError;
 
 use super::CheckpointError;
 
-/// Why a run could not go on.
+/// Why a run cannot start or continue.
 #[derive(Debug, thiserror::Error)]
 pub enum TrainError {
     /// The capture has nothing to train on.
@@ -19,7 +19,7 @@ pub enum TrainError {
     Init {
         /// The capture's folder.
         capture: PathBuf,
-        /// What is wrong with them.
+        /// The problem with the points.
         source: InitError,
     },
     /// The scene is too small or too large for single precision.
@@ -29,7 +29,7 @@ pub enum TrainError {
     SceneSize {
         /// The capture's folder.
         capture: PathBuf,
-        /// Its size, see [`SceneScale`](splat_model::SceneScale).
+        /// Size of the scene, see [`SceneScale`](splat_model::SceneScale).
         size: f64,
     },
     /// A setting is out of range.
@@ -41,10 +41,10 @@ pub enum TrainError {
     /// An op refused its input.
     #[error(transparent)]
     Op(#[from] OpError),
-    /// The model, the strategy or a hook cannot be used as they are.
+    /// The model, the strategy or a hook is unusable.
     #[error("{0}")]
     Setup(String),
-    /// The loss has no term, or does not depend on what was rendered.
+    /// The loss has no terms, or does not depend on the rendered image.
     #[error("the loss {0}")]
     Loss(&'static str),
     /// The loss stays NaN or infinite.
@@ -56,9 +56,9 @@ pub enum TrainError {
         step: usize,
         /// Name of its photo.
         view: String,
-        /// Its loss.
+        /// Value of the loss.
         value: f32,
-        /// How many they are.
+        /// Number of such steps.
         in_a_row: usize,
     },
 }

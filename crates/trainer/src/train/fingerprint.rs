@@ -1,18 +1,18 @@
-//! What a run remembers of its capture, so that it is not gone on with on another.
+//! Fingerprint of a capture, so that a run is not resumed on another one.
 
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
 use splat_data::{Capture, View};
 
-/// What tells one capture from another: of each view name, size, camera, use and photo; the number
-/// of points.
+/// Properties that identify a capture: for each view name, size, camera, use and photo; and the
+/// points.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub(super) struct Fingerprint {
-    /// Name of its folder, for words only: folders are moved.
+    /// Name of the folder, used in messages only, since folders are moved.
     name: String,
     points: usize,
-    /// Checksum of the points' positions, to the bit: the scene's size is made of them.
+    /// Checksum of the exact positions of the points, which determine the scene's size.
     positions: u32,
     views: Vec<ViewPrint>,
 }
@@ -21,14 +21,14 @@ pub(super) struct Fingerprint {
 struct ViewPrint {
     name: String,
     size: [u32; 2],
-    /// Checksum of intrinsics and pose, to the bit.
+    /// Checksum of the exact intrinsics and pose.
     camera: u32,
     /// Checksum of the pixels.
     photo: u32,
     usage: Usage,
 }
 
-/// What a view is for.
+/// Use of a view.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Usage {
@@ -38,7 +38,7 @@ enum Usage {
 }
 
 impl Fingerprint {
-    /// Of a capture as it was loaded, downscaling included.
+    /// Fingerprint of a capture as loaded, downscaling included.
     pub(super) fn of(capture: &Capture) -> Self {
         let mut views: Vec<_> = capture.views.par_iter().map(ViewPrint::of).collect();
         for &index in &capture.split.train {
@@ -60,8 +60,8 @@ impl Fingerprint {
         &self.name
     }
 
-    /// The first thing that makes `given` another capture than this one, in words. Photos whose
-    /// pixels alone differ do not: see [`changed_photos`](Self::changed_photos).
+    /// The first difference between this capture and `given`, in words. Photos that differ in
+    /// pixels only are no difference, see [`changed_photos`](Self::changed_photos).
     pub(super) fn difference(&self, given: &Self) -> Option<String> {
         let named = |print: &Self, name: &str| print.views.iter().any(|view| view.name == name);
         let missing = |from: &Self, of: &Self| {
@@ -117,7 +117,7 @@ impl Fingerprint {
         (self.positions != given.positions).then(|| "its points lie in other places".to_owned())
     }
 
-    /// Names of the photos of `given`, the same capture, whose pixels are others.
+    /// Names of the photos of `given`, the same capture, whose pixels have changed.
     pub(super) fn changed_photos(&self, given: &Self) -> Vec<String> {
         let pairs = self.views.iter().zip(&given.views);
         let changed = pairs.filter(|(was, is)| was.photo != is.photo);
@@ -182,7 +182,7 @@ mod tests {
         Capture::load(folder, &options).unwrap()
     }
 
-    /// What was changed, and the words that must tell it.
+    /// A change, and the words that must report it.
     type Change = (fn(&mut Capture), &'static [&'static str]);
 
     #[test]

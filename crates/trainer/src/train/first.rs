@@ -1,12 +1,12 @@
-//! The first Gaussians of a run.
+//! Initial Gaussians of a run.
 
 use splat_data::{Capture, SceneScale, SplatData};
 use splat_model::{InitSettings, splats_from_points};
 
 use super::TrainError;
 
-/// How many Gaussians are worth their time where no setting says it: seven for every ten pixels of
-/// a photo, or one for every hundred of all photos that are trained on, whichever is more.
+/// Default limit of Gaussians: seven for every ten pixels of a photo, or one for every hundred
+/// pixels of all training photos, whichever is more.
 pub(super) fn default_max_gaussians(capture: &Capture) -> usize {
     let pixels = |view: &usize| {
         let view = &capture.views[*view];

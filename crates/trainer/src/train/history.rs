@@ -1,4 +1,4 @@
-//! What a run has logged.
+//! The log of a run.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,11 +11,11 @@ pub struct History {
     pub terms: Vec<String>,
     /// One entry per step whose loss was finite.
     pub losses: Vec<LossRecord>,
-    /// Number of Gaussians whenever it changed, and at the beginning.
+    /// Number of Gaussians at the start and after every change.
     pub counts: Vec<(usize, usize)>,
-    /// Held-out PSNR in dB, by step, where it was measured.
+    /// Held-out PSNR in dB, by step, if measured.
     pub held_out_psnr: Vec<(usize, f64)>,
-    /// What looked wrong, each thing once.
+    /// Warnings, each once.
     #[serde(default)]
     pub warnings: Vec<Warning>,
 }
@@ -25,14 +25,14 @@ pub struct History {
 pub struct LossRecord {
     /// The step, from 1.
     pub step: usize,
-    /// The weighted sum.
+    /// Weighted sum.
     pub total: f32,
-    /// The terms, without their weights.
+    /// Unweighted terms.
     pub terms: Vec<f32>,
 }
 
 impl History {
-    /// Mean total loss over the last `count` steps, if there were any.
+    /// Mean total loss over the last `count` steps, if any.
     pub fn mean_loss(&self, count: usize) -> Option<f64> {
         let recent = &self.losses[self.losses.len().saturating_sub(count)..];
         (!recent.is_empty())

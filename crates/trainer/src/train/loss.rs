@@ -1,4 +1,4 @@
-//! What is minimised: any closure, or a list of named, weighted terms.
+//! The loss: a closure, or a list of named, weighted terms.
 
 use std::cell::OnceCell;
 
@@ -9,7 +9,7 @@ use splat_model::ops::{OpError, Rendered, photometric};
 
 use crate::photo::values;
 
-/// A training view as a loss sees it.
+/// A training view, as passed to a loss.
 #[derive(Debug)]
 pub struct TargetView<'a> {
     /// Name of the photo.
@@ -19,12 +19,12 @@ pub struct TargetView<'a> {
     /// The step, from 0.
     pub step: usize,
     pixels: Tensor<4, Int>,
-    /// Made when a loss asks for it.
+    /// Computed on demand.
     image: OnceCell<Tensor<4>>,
 }
 
 impl<'a> TargetView<'a> {
-    /// A view of the photo with these pixels, 0 to 255, `[1, H, W, 3]`.
+    /// A view of the photo with these levels, 0 to 255, `[1, H, W, 3]`.
     pub fn new(
         name: &'a str,
         pixels: Tensor<4, Int>,
@@ -46,8 +46,8 @@ impl<'a> TargetView<'a> {
         self.image.get_or_init(make).clone()
     }
 
-    /// The photo as it is stored, `[1, H, W, 3]` from 0 to 255: what
-    /// [`photometric`] reads without a copy in between.
+    /// The photo as stored, levels `[1, H, W, 3]` from 0 to 255, which [`photometric`] reads
+    /// without a copy.
     pub fn pixels_u8(&self) -> Tensor<4, Int> {
         self.pixels.clone()
     }
@@ -69,7 +69,7 @@ pub struct LossTerms {
     groups: Vec<Group>,
 }
 
-/// Terms that are measured together, as one tensor.
+/// Terms measured together, as one tensor.
 struct Group {
     /// Names and weights.
     terms: Vec<(String, f64)>,
@@ -79,7 +79,7 @@ struct Group {
 type Measure = dyn Fn(&TargetView, &Rendered) -> Result<Tensor<1>, OpError> + Send;
 
 impl LossTerms {
-    /// No terms yet.
+    /// An empty list of terms.
     pub fn new() -> Self {
         Self::default()
     }
@@ -94,9 +94,8 @@ impl LossTerms {
         self.terms([(name, weight)], term)
     }
 
-    /// Adds terms, names and weights, that one closure measures together: as one tensor of as many
-    /// values, because to cut it and put it together again is work for the device, and more of it
-    /// for the gradient.
+    /// Adds several terms, with names and weights, measured by one closure as one tensor with a
+    /// value per term. That avoids slicing and joining on the device, and in the gradient.
     pub fn terms(
         mut self,
         terms: impl IntoIterator<Item = (impl Into<String>, f64)>,
@@ -125,8 +124,7 @@ impl LossTerms {
         terms.map(|(name, _)| name.as_str())
     }
 
-    /// The weighted sum, and the terms without their weights, detached, in groups; `None` without
-    /// terms.
+    /// The weighted sum, and the unweighted, detached terms in groups; `None` without terms.
     pub(super) fn evaluate(
         &self,
         view: &TargetView,
@@ -164,9 +162,9 @@ impl LossTerms {
     }
 }
 
-/// What [`TrainerBuilder::loss`](super::TrainerBuilder::loss) takes.
+/// A loss that [`TrainerBuilder::loss`](super::TrainerBuilder::loss) accepts.
 pub trait IntoLoss {
-    /// As terms.
+    /// Converts to terms.
     fn into_loss(self) -> LossTerms;
 }
 

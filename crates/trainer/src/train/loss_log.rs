@@ -1,15 +1,14 @@
-//! Losses that are still on the device, and their way into the history.
+//! Losses still on the device, until they are read into the history.
 
 use burn::tensor::{Tensor, Transaction};
 use splat_ops::OpError;
 
 use super::{LossRecord, TrainError};
 
-/// Losses are read back from the device in batches of this many steps.
+/// Number of steps whose losses are read from the device at once.
 pub const LOSS_BATCH: usize = 10;
 
-/// A run ends after this many steps in a row without a finite loss: no single photo is the cause
-/// then.
+/// Steps in a row without a finite loss after which a run ends; a single photo cannot be the cause.
 const NOT_FINITE_LIMIT: usize = 100;
 
 /// A loss on the device.
@@ -22,16 +21,16 @@ pub(super) struct UnreadLoss {
     pub(super) values: Vec<Tensor<1>>,
 }
 
-/// Losses not read yet.
+/// Losses not yet read.
 #[derive(Default)]
 pub(super) struct LossLog {
     unread: Vec<UnreadLoss>,
 }
 
-/// What a loss that was read turned out to be.
+/// The result of reading a loss.
 pub(super) enum ReadLoss {
     Finite(LossRecord),
-    /// Its step, its views, its value.
+    /// Step, views and value.
     NotFinite(usize, Vec<usize>, f32),
 }
 
@@ -40,12 +39,12 @@ impl LossLog {
         self.unread.push(loss);
     }
 
-    /// Whether as many wait as one transfer takes.
+    /// True if a full batch is waiting.
     pub(super) fn is_full(&self) -> bool {
         self.unread.len() >= LOSS_BATCH
     }
 
-    /// Reads all that wait, of a total and `terms` terms each, in one transfer.
+    /// Reads all waiting losses, each a total and `terms` terms, in one transfer.
     pub(super) fn read(&mut self, terms: usize) -> Result<Vec<ReadLoss>, OpError> {
         let unread = core::mem::take(&mut self.unread);
         if unread.is_empty() {
@@ -76,10 +75,10 @@ impl LossLog {
     }
 }
 
-/// Checks how long losses have not been finite.
+/// Checks how many steps in a row had no finite loss.
 ///
 /// # Errors
-/// [`TrainError::NotFinite`] after 100 steps in a row, or all of a shorter run.
+/// [`TrainError::NotFinite`] after 100 such steps in a row, or after all of a shorter run.
 pub(super) fn check_finite(
     step: usize,
     view: &str,

@@ -1,4 +1,4 @@
-//! Training: render a view, measure the loss, step the optimisers, let the strategy edit the rows;
+//! Training: render a view, measure the loss, step the optimisers, let the strategy edit the rows,
 //! repeat (3DGS sections 5 and 7.1).
 
 mod builder;

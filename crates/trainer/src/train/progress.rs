@@ -1,4 +1,4 @@
-//! What a run shows and leaves.
+//! Progress and result of a run.
 
 use std::any::Any;
 use std::time::Duration;
@@ -14,7 +14,7 @@ use super::{Checkpoint, CheckpointError, History};
 use crate::evaluate::{Scores, evaluate_with};
 use crate::hooks::Hook;
 
-/// Where a run stands, for whoever shows it.
+/// Progress of a run, for display.
 #[derive(Debug, Clone, Copy)]
 pub struct Progress<'a> {
     /// Steps done.
@@ -23,32 +23,33 @@ pub struct Progress<'a> {
     pub steps: usize,
     /// Number of Gaussians.
     pub gaussians: usize,
-    /// What was logged so far; losses lag behind by up to [`LOSS_BATCH`](super::LOSS_BATCH) steps.
+    /// Log so far; losses lag behind by up to [`LOSS_BATCH`](super::LOSS_BATCH) steps.
     pub history: &'a History,
 }
 
-/// What a run leaves.
+/// Result of a run.
 pub struct Trained<M: SplatModel = Gaussians> {
     /// The model, without autodiff.
     pub model: M,
-    /// What was logged.
+    /// The log.
     pub history: History,
-    /// How to render the model as it was trained, at its highest degree of spherical harmonics.
+    /// Settings that render the model as it was trained, at its highest degree of spherical
+    /// harmonics.
     pub render_settings: RenderSettings,
-    /// Steps done; fewer than asked for when interrupted.
+    /// Steps done; fewer than requested if interrupted.
     pub steps: usize,
     /// Time spent in steps, over all sessions of the run.
     pub elapsed: Duration,
-    /// How the scene must be rendered to look as it did in training.
+    /// Scene settings that reproduce the look in training.
     pub settings: SceneSettings,
-    /// As it was trained, with the optimisers' state.
+    /// The final state, with that of the optimisers.
     pub(super) state: State<M>,
     pub(super) run: RunRecord,
 }
 
 impl<M: SplatModel> Trained<M> {
-    /// The scene, with the settings that it must be rendered with. What hooks do to cameras,
-    /// background or picture is not part of it.
+    /// The scene with its render settings. Changes by hooks to cameras, background or image are not
+    /// included.
     pub fn to_data(&self) -> SplatData {
         SplatData {
             settings: self.settings.clone(),
@@ -56,8 +57,8 @@ impl<M: SplatModel> Trained<M> {
         }
     }
 
-    /// The state to resume from. It is as large again as the scene, and the optimisers' moments
-    /// twice that.
+    /// The state to resume from: the size of the scene, plus twice that for the optimisers'
+    /// moments.
     ///
     /// # Errors
     /// When the device fails.
@@ -65,7 +66,7 @@ impl<M: SplatModel> Trained<M> {
         Checkpoint::of(&self.state, &self.run)
     }
 
-    /// Scores views as the run does for its own curve: with what its hooks do.
+    /// Scores views as the run does for its own curve, hooks included.
     ///
     /// # Errors
     /// When an op refuses its input, or the device fails.
@@ -86,7 +87,7 @@ impl<M: SplatModel> Trained<M> {
         )
     }
 
-    /// The first hook of this type, as training left it.
+    /// The first hook of this type, in its trained state.
     pub fn hook<H: Hook>(&self) -> Option<&H> {
         let hooks = self.state.hooks.0.iter();
         hooks

@@ -7,14 +7,14 @@ use splat_model::strategy::StepInfo;
 use super::TrainSettings;
 use splat_data::{Capture, View};
 
-/// By what photos are divided at a step.
+/// Divisor of the photos at a step.
 pub(super) fn factor(config: &TrainSettings, at: &StepInfo) -> u32 {
     let stages = at.step / at.run.milestone(config.coarse_every);
     let left = (config.coarse_halvings as usize).saturating_sub(stages);
     1 << left
 }
 
-/// The small photos of the present stage, made when a step asks for them.
+/// Downscaled photos of the current stage, made on demand.
 #[derive(Default)]
 pub(super) struct CoarseViews {
     factor: u32,
@@ -22,7 +22,7 @@ pub(super) struct CoarseViews {
 }
 
 impl CoarseViews {
-    /// A view of the capture, divided.
+    /// A downscaled view of the capture.
     pub(super) fn view(&mut self, capture: &Capture, index: usize, factor: u32) -> View {
         if self.factor != factor {
             self.factor = factor;
@@ -104,7 +104,7 @@ mod tests {
             &small.image,
             &views.view(&capture, 3, 2).image
         ));
-        // No photo gets smaller than the window of SSIM.
+        // No photo becomes smaller than the window of SSIM.
         let least = views.view(&capture, 3, 1 << 8);
         let shorter = least.width.min(least.height);
         assert!((11..22).contains(&shorter), "{shorter}");

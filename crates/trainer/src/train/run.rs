@@ -1,4 +1,4 @@
-//! A run from its first step to its last: what is watched, measured and kept on the way.
+//! The steps of a run, with progress, measurements and autosaves.
 
 use splat_data::{Capture, SceneSettings};
 use splat_model::SplatModel;
@@ -12,13 +12,13 @@ use crate::evaluate::evaluate_with;
 impl<M: SplatModel> Trainer<M> {
     /// Runs to the last step, or until interrupted.
     ///
-    /// A gradient that is not finite never reaches the optimiser (see
-    /// [`SplatAdam`](splat_model::optimizer::SplatAdam)), so a step whose loss is not is a warning,
-    /// and an error only when many come in a row.
+    /// Gradients that are not finite never reach the optimiser (see
+    /// [`SplatAdam`](splat_model::optimizer::SplatAdam)). A step without a finite loss is therefore
+    /// a warning, and an error only if many follow in a row.
     ///
     /// # Errors
-    /// When the loss is not finite for 100 steps in a row, or for the whole of a shorter run, or an
-    /// op refuses what it is given.
+    /// When the loss is not finite for 100 steps in a row, or for all of a shorter run, or an op
+    /// refuses its input.
     pub fn run(mut self) -> Result<Trained<M>, TrainError> {
         if self.state.step == 0 {
             let splats = self.state.model.model().to_data();
@@ -43,7 +43,7 @@ impl<M: SplatModel> Trainer<M> {
         })
     }
 
-    /// Takes the steps that are left, until interrupted or told to stop.
+    /// Takes the remaining steps, until interrupted or stopped.
     fn advance(&mut self) -> Result<(), TrainError> {
         while self.state.step < self.config.steps {
             match self.watch.commands.next(&self.watch.interrupt) {
@@ -53,7 +53,7 @@ impl<M: SplatModel> Trainer<M> {
                     self.read_losses()?;
                     self.save();
                 }
-                // Whoever asked may be gone.
+                // The receiver may be gone.
                 Next::Snapshot(to) => drop(to.send(self.snapshot())),
             }
         }
@@ -80,7 +80,7 @@ impl<M: SplatModel> Trainer<M> {
         Ok(())
     }
 
-    /// The scene as it is, and how it is to be rendered.
+    /// The current scene, with its render settings.
     pub fn snapshot(&self) -> Snapshot {
         let mut scene = self.state.model.model().to_data();
         scene.settings = self.scene_settings();
@@ -102,14 +102,14 @@ impl<M: SplatModel> Trainer<M> {
     fn save_if_due(&mut self) -> Result<(), TrainError> {
         let autosave = self.watch.autosave.as_ref();
         if autosave.is_some_and(|autosave| autosave.last.elapsed() >= autosave.every) {
-            // The losses up to here are part of the checkpoint.
+            // The losses so far are part of the checkpoint.
             self.read_losses()?;
             self.save();
         }
         Ok(())
     }
 
-    /// Keeps the present state where the run's are kept. Says if it cannot be, and goes on.
+    /// Autosaves the current state. On failure it warns and continues.
     fn save(&mut self) {
         let Some(autosave) = &mut self.watch.autosave else {
             return;
@@ -117,8 +117,8 @@ impl<M: SplatModel> Trainer<M> {
         let saved = Checkpoint::of(&self.state, &self.record)
             .and_then(|checkpoint| (autosave.save)(&checkpoint));
         autosave.last = std::time::Instant::now();
-        // Training is worth more than what could not be kept of it. Not part of the history: when
-        // the run is resumed it is news again.
+        // A failed autosave does not end training. The warning is not part of the history, since it
+        // should be repeated after a resume.
         if let Err(error) = saved
             && !autosave.failures.contains(&error.kind())
         {
@@ -130,12 +130,12 @@ impl<M: SplatModel> Trainer<M> {
         }
     }
 
-    /// Keeps what was done before a step that failed, if there is a place for it and nothing of the
-    /// step was done. A loss that is not finite is no reason to replace a state of before it.
+    /// Saves the state before a failed step, if autosaving is set up and nothing of the step was
+    /// done. A loss that is not finite does not replace an earlier state.
     fn rescue(&mut self, error: &TrainError) {
         let diverged = matches!(error, TrainError::NotFinite { .. });
         if self.state.step > 0 && !diverged && !self.in_step {
-            // What cannot be read any more is not what is to be kept.
+            // Losses that cannot be read are dropped.
             let _ = self.read_losses();
             self.save();
         }
@@ -150,7 +150,7 @@ impl<M: SplatModel> Trainer<M> {
         let Capture { views, split, .. } = &*self.capture;
         let mut order = views::ViewOrder::new(self.config.seed, split.train.len());
         let name = |view: usize| views[split.train[view]].name.clone();
-        // The loss of several views tells of none of them.
+        // The loss of several views describes none of them individually.
         let views = match self.config.views_per_step {
             1 => split.train.len(),
             _ => 0,
@@ -159,7 +159,7 @@ impl<M: SplatModel> Trainer<M> {
         found.into_iter().for_each(|warning| self.warn(warning));
     }
 
-    /// Says what looks wrong, unless it was said before.
+    /// Issues a warning, unless it was issued before.
     pub(super) fn warn(&mut self, warning: Warning) {
         if let Some(news) = warning.beyond(&self.state.history.warnings) {
             (self.watch.on_warning)(&news);

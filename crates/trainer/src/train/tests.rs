@@ -35,7 +35,7 @@ fn builder_on(capture: Arc<Capture>) -> TrainerBuilder {
         .device(Device::flex())
 }
 
-/// Growth ends where a setting says, else where the photos do.
+/// Growth ends at the limit of the settings, or else at the default limit.
 #[test]
 fn the_photos_say_how_many_gaussians_are_worthwhile() {
     let most = |capture: Capture, config: TrainSettings| {
@@ -60,7 +60,7 @@ fn the_photos_say_how_many_gaussians_are_worthwhile() {
 /// Interrupted after a refinement and resumed from the file, a run ends with the same scene.
 #[test]
 fn a_resumed_run_goes_on_as_if_it_had_not_stopped() {
-    // A quarter of the resolution for 60 steps, and half of it for another 60.
+    // A quarter of the resolution for 60 steps, then half for another 60.
     let builder = || {
         builder().settings(TrainSettings {
             steps: 240,
@@ -90,7 +90,7 @@ fn a_resumed_run_goes_on_as_if_it_had_not_stopped() {
     assert_eq!(second.steps, 240);
     assert_eq!(second.history.losses, whole.history.losses);
     assert!(second.model.to_data() == whole.model.to_data());
-    // Density control must have been part of it.
+    // Density control must have been involved.
     assert_ne!(whole.model.len(), capture().points.len());
 
     let mut damaged = first.checkpoint().unwrap();
@@ -99,7 +99,7 @@ fn a_resumed_run_goes_on_as_if_it_had_not_stopped() {
     let error = error.unwrap_err().to_string();
     assert!(error.contains("`quats` has"), "{error}");
 
-    // A bit that is lost anywhere is noticed.
+    // A single flipped bit is noticed.
     first.checkpoint().unwrap().save(&path).unwrap();
     let whole = std::fs::read(&path).unwrap();
     assert!(Checkpoint::parse(&path, &whole).is_ok());
@@ -116,7 +116,7 @@ fn a_resumed_run_goes_on_as_if_it_had_not_stopped() {
     assert!(error.contains("checkpoint.safetensors"), "{error}");
 }
 
-/// What an autosave kept is where a killed run goes on from, to the same end.
+/// A killed run resumes from its last autosave and ends the same.
 #[test]
 fn a_killed_run_goes_on_from_its_last_autosave() {
     let kept = Arc::new(Mutex::new(Vec::new()));
@@ -139,7 +139,7 @@ fn a_killed_run_goes_on_from_its_last_autosave() {
     assert!(resumed.model.to_data() == whole.model.to_data());
 }
 
-/// What cannot be kept is told once for each kind of failure, and costs nothing of the run.
+/// Failed saves are reported once per kind and do not affect the run.
 #[test]
 fn a_run_outlives_its_autosaves() {
     let said = Arc::new(Mutex::new(Vec::new()));
@@ -155,7 +155,7 @@ fn a_run_outlives_its_autosaves() {
             };
             Err(CheckpointError::Io {
                 path: "there".into(),
-                // As where a name differs from time to time.
+                // As if a name differed each time.
                 source: std::io::Error::new(kind, format!("attempt {count}")),
             })
         })
@@ -168,12 +168,12 @@ fn a_run_outlives_its_autosaves() {
     let said = said.lock().unwrap();
     assert_eq!(said.len(), 2, "{said:?}");
     assert!(said[0].contains("there: attempt 1"), "{said:?}");
-    // The next run that goes on from here is to hear of it again.
+    // After a resume the failure should be reported again.
     assert!(trained.history.warnings.is_empty());
 }
 
-/// Another run is not gone on with: another capture, other settings, another loss; photos whose
-/// pixels alone changed are named.
+/// A run does not resume from another run: another capture, other settings, another loss. Photos
+/// whose pixels alone have changed are named.
 #[test]
 fn a_checkpoint_is_of_one_run() {
     let first = builder()
@@ -295,8 +295,8 @@ fn a_step_that_fails_leaves_what_was_done_before_it() {
     assert_eq!(*kept.lock().unwrap(), [7]);
 }
 
-/// A photo whose loss is NaN, whose gradients are too, is passed over; nothing of it stays in the
-/// scene or in the optimiser.
+/// A photo with NaN loss and gradients is skipped, and leaves no trace in the scene or the
+/// optimiser.
 #[test]
 fn a_photo_without_a_loss_is_named_and_passed_over() {
     let bad = capture().train_views().nth(3).unwrap().name.clone();
@@ -326,7 +326,7 @@ fn a_photo_without_a_loss_is_named_and_passed_over() {
     assert_eq!(*view, bad);
     assert!(*step <= 28, "first seen at step {step}");
     assert_eq!(trained.history.warnings, said);
-    // 240 steps are 8 rounds of 28 views and a part of one.
+    // 240 steps are 8 rounds of 28 views and part of another.
     let recorded = trained.history.losses.len();
     assert!((231..=232).contains(&recorded), "{recorded} losses");
     let data = trained.model.to_data();
@@ -350,7 +350,7 @@ fn a_photo_without_a_loss_is_named_and_passed_over() {
     );
     assert!(mean(last) < 0.7 * mean(first), "it did not learn");
 
-    // What was said stays with the run, and is not said again.
+    // Warnings stay with the run and are not repeated.
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("checkpoint.safetensors");
     trained.checkpoint().unwrap().save(&path).unwrap();

@@ -1,4 +1,4 @@
-//! The training views as strategies see them.
+//! The training views, as strategies see them.
 
 use burn::tensor::{Device, Tensor};
 use splat_data::Capture;
@@ -7,7 +7,7 @@ use splat_model::strategy::TrainingViews;
 
 use crate::photo::photo;
 
-/// The views of a capture that are trained on, in the capture's own resolution.
+/// The training views of a capture, at its own resolution.
 pub(super) struct CaptureViews<'a> {
     pub(super) capture: &'a Capture,
     pub(super) origin: [f64; 3],

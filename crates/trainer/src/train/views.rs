@@ -1,11 +1,11 @@
-//! The order in which views are trained on.
+//! The order of training views.
 
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_pcg::Pcg64Mcg;
 
-/// Which of `count` views step `step` trains on: every epoch is a permutation drawn from (seed,
-/// epoch) alone, so a resumed run goes on as it would have.
+/// Order of `count` views: every epoch is a permutation drawn from (seed, epoch) alone, so that a
+/// resumed run continues with the same views.
 pub(super) struct ViewOrder {
     seed: u64,
     epoch: Option<(usize, Vec<usize>)>,

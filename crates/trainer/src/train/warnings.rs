@@ -1,8 +1,8 @@
-//! What looks wrong with a run: before it, in the capture and the settings, and during it, in the
+//! Warnings about a run: before it, from the capture and the settings, and during it, from the
 //! losses.
 //!
-//! A warning stops nothing. Thresholds compare with the other cameras, photos or views, by medians,
-//! so that one bad one stands out and a scene of any size or kind does not.
+//! A warning stops nothing. Thresholds are relative to the medians of the other cameras, photos or
+//! views, so that a single outlier stands out, and a scene of unusual size or kind does not.
 
 pub(super) mod capture_checks;
 pub(super) mod loss_checks;
@@ -11,25 +11,25 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-/// Something that looks wrong with a run. `Display` gives one line: what, how much, and what to do.
+/// A problem with a run. `Display` gives one line: the problem, its extent, and the remedy.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[non_exhaustive]
 pub enum Warning {
-    /// Many points lie exactly where another one does.
+    /// Many points coincide exactly.
     CoincidentPoints {
-        /// Number of points whose place is taken.
+        /// Number of points at the position of another one.
         count: usize,
         /// Number of points.
         points: usize,
     },
-    /// Most points lie in a place that is tiny as the cameras see it.
+    /// Most points lie within a region that is tiny as seen by the cameras.
     CompactPoints {
-        /// Half of the points lie within this of their median, world units.
+        /// Radius around their median that contains half of the points, world units.
         radius: f64,
         /// Median distance of the cameras, world units.
         distance: f64,
     },
-    /// The first Gaussians are so large that one covers most of a picture.
+    /// The initial Gaussians are so large that one covers most of a picture.
     LargeGaussians {
         /// Their median standard deviation, world units.
         scale: f64,
@@ -38,22 +38,22 @@ pub enum Warning {
         /// `init.scale`.
         init_scale: f64,
     },
-    /// Cameras that stand among the points, where the others do not.
+    /// Cameras among the points, where other cameras are not.
     CamerasInsidePoints {
         /// Names of their photos.
         views: Vec<String>,
-        /// From the first of them, the distance within which 1 % of the points lie, world units.
+        /// Distance from the first of them that includes 1 % of the points, world units.
         near: f64,
-        /// Its median over all cameras.
+        /// Median of that distance over all cameras.
         usual: f64,
     },
-    /// Cameras many times as far from the points as the others.
+    /// Cameras many times farther from the points than the others.
     CamerasFarAway {
         /// Names of their photos.
         views: Vec<String>,
         /// Median distance of the points from the first of them, world units.
         distance: f64,
-        /// Its median over all cameras.
+        /// Median of that distance over all cameras.
         usual: f64,
     },
     /// Cameras that see almost none of the points.
@@ -65,7 +65,7 @@ pub enum Warning {
         /// Number of points.
         points: usize,
     },
-    /// Photos whose neighbouring pixels have nothing to do with each other.
+    /// Photos whose neighbouring pixels are unrelated.
     NoisePhotos {
         /// Their names.
         views: Vec<String>,
@@ -74,19 +74,19 @@ pub enum Warning {
     },
     /// Learning rates far above the defaults.
     HighRates {
-        /// Each setting, and how many times its default it is.
+        /// Each setting, as a multiple of its default.
         rates: Vec<(String, f64)>,
     },
-    /// Photos of a resumed run whose pixels are not those that it was begun with.
+    /// Photos of a resumed run whose pixels have changed since it began.
     PhotosChanged {
         /// Their names.
         views: Vec<String>,
     },
-    /// The state of the run could not be kept.
+    /// The state of the run could not be saved.
     NotSaved {
         /// Steps done.
         step: usize,
-        /// Why, in a line that names the file.
+        /// The reason, in one line that names the file.
         reason: String,
     },
     /// The loss of a step was NaN or infinite.
@@ -107,20 +107,20 @@ pub enum Warning {
         /// Median loss of all views.
         usual: f64,
     },
-    /// The loss rises.
+    /// The loss is rising.
     LossRises {
         /// Steps done.
         step: usize,
         /// Median loss over the last quarter of the run.
         loss: f64,
-        /// The least of such medians before.
+        /// The smallest earlier median.
         least: f64,
     },
     /// The loss has not fallen.
     LossDoesNotFall {
         /// Steps done.
         step: usize,
-        /// Median loss at the beginning.
+        /// Median loss at the start.
         first: f64,
         /// Median loss over the last quarter of the run.
         last: f64,
@@ -128,8 +128,8 @@ pub enum Warning {
 }
 
 impl Warning {
-    /// What of it `known` does not say yet: a loss that is not finite is news per photo, hard views
-    /// are news by their names, everything else is news once.
+    /// The part that `known` does not cover yet. A loss that is not finite is new for each photo,
+    /// hard views for each name, and everything else once.
     pub(super) fn beyond(mut self, known: &[Self]) -> Option<Self> {
         for other in known {
             match (&mut self, other) {
@@ -254,8 +254,7 @@ impl fmt::Display for Warning {
     }
 }
 
-/// A length in the capture's unit, whatever that is: digits that mean something, in any order of
-/// magnitude.
+/// A length in the capture's unit, formatted with its significant digits at any magnitude.
 struct Length(f64);
 
 impl fmt::Display for Length {
@@ -267,7 +266,7 @@ impl fmt::Display for Length {
     }
 }
 
-/// The first name, and how many there are beside it.
+/// The first name, and the number of others.
 struct Names<'a>(&'a [String]);
 
 impl fmt::Display for Names<'_> {
@@ -280,12 +279,12 @@ impl fmt::Display for Names<'_> {
     }
 }
 
-/// The middle value, the upper one of two; NaN of nothing.
+/// The middle value, the upper of two; NaN if empty.
 fn median(values: impl IntoIterator<Item = f64>) -> f64 {
     quantile(values, 0.5)
 }
 
-/// The value below which a share of the values lies; NaN of nothing.
+/// The value at a quantile; NaN if empty.
 fn quantile(values: impl IntoIterator<Item = f64>, share: f64) -> f64 {
     let mut values: Vec<f64> = values.into_iter().collect();
     if values.is_empty() {

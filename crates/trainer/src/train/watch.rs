@@ -1,4 +1,4 @@
-//! Who watches a run, and what is kept of it on the way.
+//! Observers of a run, and its autosaves.
 
 use std::sync::Arc;
 use std::sync::atomic::AtomicBool;
@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 use super::commands::Commands;
 use super::{Checkpoint, CheckpointError, Progress, Warning};
 
-/// Puts a checkpoint where it outlives the process.
+/// Stores a checkpoint outside the process.
 type SaveCheckpoint = dyn FnMut(&Checkpoint) -> Result<(), CheckpointError> + Send;
 
-/// Who watches a run, and what is kept of it on the way.
+/// Observers of a run, and its autosaves.
 pub(super) struct Watch {
     pub(super) interrupt: Arc<AtomicBool>,
     pub(super) commands: Commands,
@@ -20,17 +20,17 @@ pub(super) struct Watch {
     pub(super) on_warning: Box<dyn FnMut(&Warning) + Send>,
 }
 
-/// Keeps the state of a run from time to time.
+/// Saves the state of a run at intervals.
 pub(super) struct Autosave {
     pub(super) every: Duration,
     pub(super) last: Instant,
     pub(super) save: Box<SaveCheckpoint>,
-    /// Kinds of failure that were told.
+    /// Kinds of failure already reported.
     pub(super) failures: Vec<String>,
 }
 
 impl Default for Watch {
-    /// Nobody.
+    /// No observers.
     fn default() -> Self {
         Self {
             interrupt: Arc::default(),

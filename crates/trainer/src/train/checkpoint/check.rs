@@ -1,26 +1,26 @@
-//! Whether the parts of a checkpoint fit together, before any of it reaches a device: what is let
-//! through here must neither stop a run later nor spoil it. What only the model, the strategy and
-//! the hooks know is checked where they are restored.
+//! Consistency checks of a checkpoint, before any of it reaches a device: data that passes must
+//! neither stop a run later nor corrupt it. Properties that only the model, the strategy and the
+//! hooks know are checked when those are restored.
 
 use burn_pack::Scalar;
 
 use super::{History, Meta, SavedScalar, SavedTensor};
 use crate::train::settings::MOST_STEPS;
 
-/// More is no run but a damaged file: 300 years.
+/// Longest plausible run: 300 years.
 const LONGEST_SECONDS: f64 = 1e10;
-/// Beginning of the names of the model's tensors and numbers.
+/// Prefix of the model's tensors and numbers.
 const MODEL: &str = "model.";
-/// End of the name of an optimiser's count of steps.
+/// Suffix of an optimiser's step count.
 const TIME: &str = ".time";
 
-/// Tensors: there is a model, and all have numbers in them.
+/// Checks tensors: a model exists, and all values are numbers.
 pub(super) fn tensors(tensors: &[SavedTensor]) -> Result<(), String> {
     if !tensors.iter().any(|(name, ..)| name.starts_with(MODEL)) {
         return Err("no tensor of a model (`model.…`) is there".to_owned());
     }
     for (name, _, values) in tensors {
-        // Opacities of 0 and 1 and flat Gaussians are infinite here, and can be.
+        // Infinite values are valid here: opacities of 0 and 1, and flat Gaussians.
         let may_be_infinite = matches!(name.as_str(), "model.opacity_logits" | "model.log_scales");
         let is_square = name.starts_with(MODEL) && name.ends_with(".moment_2");
         let bad = |value: &f32| {
@@ -38,7 +38,7 @@ pub(super) fn tensors(tensors: &[SavedTensor]) -> Result<(), String> {
     Ok(())
 }
 
-/// Everything that is no tensor.
+/// Checks everything except tensors.
 pub(super) fn meta(meta: &Meta) -> Result<(), String> {
     if !(0.0..=LONGEST_SECONDS).contains(&meta.elapsed_seconds) {
         return Err(format!("`elapsed_seconds` is {}", meta.elapsed_seconds));
@@ -63,7 +63,7 @@ pub(super) fn meta(meta: &Meta) -> Result<(), String> {
     history(&meta.history, meta.step)
 }
 
-/// Steps in order and not beyond the last one, a value for every term.
+/// Checks that steps are ordered and not beyond the last one, with a value for every term.
 fn history(history: &History, step: usize) -> Result<(), String> {
     let mut last = 0;
     for (index, record) in history.losses.iter().enumerate() {

@@ -1,4 +1,4 @@
-//! Why a checkpoint cannot be written or used.
+//! Errors of checkpoints.
 
 use std::path::PathBuf;
 
@@ -10,7 +10,7 @@ pub enum CheckpointError {
     Io {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The system's error.
         source: std::io::Error,
     },
     /// Not a checkpoint of this program, or damaged.
@@ -18,10 +18,10 @@ pub enum CheckpointError {
     Format {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The reason.
         reason: String,
     },
-    /// The checkpoint of a run on another capture.
+    /// The checkpoint belongs to a run on another capture.
     #[error(
         "{path}: the run was begun on another capture (`{name}`): {difference}; give the capture it was begun on, or begin another run in another folder"
     )]
@@ -30,20 +30,20 @@ pub enum CheckpointError {
         path: PathBuf,
         /// Name of the run's capture.
         name: String,
-        /// What differs, the first thing.
+        /// The first difference.
         difference: String,
     },
-    /// The checkpoint of a run with other settings.
+    /// The checkpoint belongs to a run with other settings.
     #[error(
         "{path}: the run was begun with {difference}; leave that out to go on with the run's settings, or begin another run in another folder"
     )]
     OtherSettings {
         /// The file.
         path: PathBuf,
-        /// Every such setting, with the two values.
+        /// Every such setting, with both values.
         difference: String,
     },
-    /// Nothing would be left to train.
+    /// No steps are left to train.
     #[error(
         "{path}: {done} of the run's {steps} steps are done; {wanted} would leave nothing to train, ask for more than {done}"
     )]
@@ -54,17 +54,17 @@ pub enum CheckpointError {
         done: usize,
         /// Steps of the run.
         steps: usize,
-        /// Steps asked for.
+        /// Requested steps.
         wanted: usize,
     },
-    /// The state could not be read back from the device, or holds what no checkpoint has a place
-    /// for.
+    /// The state could not be read from the device, or contains values that a checkpoint cannot
+    /// hold.
     #[error("the state of the run cannot be saved: {0}")]
     State(String),
 }
 
 impl CheckpointError {
-    /// What failures of one kind share, so that a kind is told once.
+    /// Identifies failures of one kind, so that each kind is reported once.
     pub(in super::super) fn kind(&self) -> String {
         match self {
             Self::Io { path, source } => format!("{} {:?}", path.display(), source.kind()),

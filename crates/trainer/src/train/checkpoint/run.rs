@@ -1,5 +1,4 @@
-//! Which run a checkpoint belongs to: its settings and its capture. Another run does not go on from
-//! it.
+//! Identity of a checkpoint's run: its settings and its capture. Another run cannot resume from it.
 
 use serde::{Deserialize, Serialize};
 
@@ -7,17 +6,17 @@ use super::super::TrainSettings;
 use super::super::fingerprint::Fingerprint;
 use super::{Checkpoint, CheckpointError};
 
-/// Settings that a resumed run may change: how long it is, and how much it may grow.
+/// Settings that a resumed run may change: its length, and the limit of growth.
 const CHANGEABLE: [&str; 2] = ["steps", "density.max_gaussians"];
 
-/// What a run is apart from its state: which settings, on which capture.
+/// A run without its state: its settings and its capture.
 #[derive(Debug, Clone, Serialize, Deserialize)]
 pub(in super::super) struct RunRecord {
     pub(in super::super) capture: Fingerprint,
-    /// As TOML, which keeps every digit.
+    /// As TOML, which preserves every digit.
     #[serde(with = "as_toml")]
     pub(in super::super) config: TrainSettings,
-    /// What was changed when it was resumed, see [`Checkpoint::changes_with`].
+    /// Changes made on resuming, see [`Checkpoint::changes_with`].
     pub(in super::super) changes: Vec<String>,
 }
 
@@ -27,10 +26,10 @@ impl Checkpoint {
         &self.meta.run.config
     }
 
-    /// Checks that a run with these settings is the run of this checkpoint, and has something left
-    /// to train. Only `steps` and `density.max_gaussians` may be others: everything else, the seed
-    /// and the first Gaussians included, would make it a run that nobody could repeat, and partly
-    /// have no effect any more.
+    /// Checks that a run with these settings is the run of this checkpoint, and has steps left.
+    /// Only `steps` and `density.max_gaussians` may differ. Any other change, including the seed
+    /// and the initial Gaussians, would make a run that nobody could repeat, and would partly have
+    /// no effect.
     ///
     /// # Errors
     /// [`CheckpointError::OtherSettings`] and [`CheckpointError::NothingLeft`].
@@ -45,7 +44,7 @@ impl Checkpoint {
             });
         }
         let (done, steps, wanted) = (self.step(), self.settings().steps, config.steps);
-        // A run whose steps are all done may still have its results to write.
+        // A run that has completed its steps may still have results to write.
         if wanted < done || (wanted == done && wanted != steps) {
             return Err(CheckpointError::NothingLeft {
                 path: self.path.clone(),
@@ -57,8 +56,7 @@ impl Checkpoint {
         Ok(())
     }
 
-    /// What going on with these settings changes about the run, and what was changed before, each
-    /// in a line.
+    /// Changes to the run made by resuming with these settings, and earlier ones, one per line.
     pub fn changes_with(&self, config: &TrainSettings) -> Vec<String> {
         let mut changes = self.meta.run.changes.clone();
         for (name, was, is) in self.settings().differences(config) {
@@ -72,8 +70,8 @@ impl Checkpoint {
         changes
     }
 
-    /// Checks that the run is this one: its capture, its settings, its strategy, the names of its
-    /// loss terms. Returns the photos that have other pixels.
+    /// Checks capture, settings, strategy and names of loss terms. Returns the photos whose pixels
+    /// have changed.
     pub(in super::super) fn check_run(
         &self,
         run: &RunRecord,

@@ -1,5 +1,4 @@
-//! Damaged checkpoints: every part that does not fit the others is refused when the file is read,
-//! by name.
+//! Damaged checkpoints: every inconsistent part is refused by name when the file is read.
 
 use std::path::Path;
 use std::sync::Arc;
@@ -36,11 +35,11 @@ fn saved() -> Checkpoint {
     trained.unwrap().checkpoint().unwrap()
 }
 
-/// The message of reading a checkpoint that was damaged before it was written.
+/// Error from reading a checkpoint that was damaged before it was written.
 fn refused(checkpoint: &Checkpoint) -> String {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("checkpoint.safetensors");
-    // What is plainly wrong is not even written.
+    // Obvious damage is not even written.
     let read = checkpoint.save(&path).and_then(|()| {
         let bytes = std::fs::read(&path).unwrap();
         Checkpoint::parse(Path::new("checkpoint.safetensors"), &bytes)
@@ -82,7 +81,7 @@ fn values_that_are_no_numbers_are_named() {
     assert!(refused(&bad).contains("`model.means.moment_2`: value 3"));
 }
 
-/// Each of these ended a resumed run by a panic, or went on with other numbers than were meant.
+/// Each of these used to make a resumed run panic, or continue with wrong numbers.
 #[test]
 fn a_run_that_cannot_have_been_is_refused() {
     let good = saved();
@@ -106,7 +105,7 @@ fn a_run_that_cannot_have_been_is_refused() {
     assert!(damaged(&late).contains("`model.means.time`"));
 }
 
-/// The message of going on from a checkpoint that was damaged, and can be read.
+/// Error from resuming from a checkpoint that is damaged but readable.
 fn not_resumed(checkpoint: Checkpoint) -> String {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("checkpoint.safetensors");
@@ -122,8 +121,7 @@ fn not_resumed(checkpoint: Checkpoint) -> String {
     message
 }
 
-/// Moments of another shape ended the first step by a panic; parts that are missing would have
-/// started anew.
+/// Moments of the wrong shape used to panic in the first step; missing parts would have restarted.
 #[test]
 fn parts_that_do_not_fit_the_run_are_refused_when_it_goes_on() {
     let good = saved();
@@ -166,7 +164,7 @@ fn parts_that_do_not_fit_the_run_are_refused_when_it_goes_on() {
     assert!(stranger.contains("belongs to nothing"), "{stranger}");
 }
 
-/// The losses of a run with other terms have no place in its table.
+/// Losses of a run with other terms do not fit its table.
 #[test]
 fn a_checkpoint_of_another_loss_is_refused() {
     let loss =

@@ -1,4 +1,4 @@
-//! Runs with parts from outside: a strategy, a model, a hook, an optimiser, commands.
+//! Runs with external parts: a strategy, a model, a hook, an optimiser, commands.
 
 use burn::module::{Module, Param};
 use burn::optim::AdamConfig;
@@ -17,7 +17,7 @@ use splat_model::{
 use super::*;
 use crate::hooks::{Hook, HookView, Purpose};
 
-/// Gaussians with one number more each, which dims their colours.
+/// Gaussians with an additional parameter that dims their colours.
 #[derive(Module, Debug)]
 struct Dimmed {
     gaussians: Gaussians,
@@ -78,7 +78,7 @@ impl SplatModel for Dimmed {
     }
 }
 
-/// Uses everything that a strategy may.
+/// Uses the whole interface of a strategy.
 #[derive(Default)]
 struct Everything {
     seen: usize,
@@ -250,8 +250,7 @@ fn extended(steps: usize) -> TrainerBuilder<Dimmed> {
         })
 }
 
-/// A run made of parts from outside trains, and goes on from a checkpoint in the middle with the
-/// same numbers.
+/// A run of external parts trains, and resumes from a checkpoint with the same numbers.
 #[test]
 fn parts_from_outside_train_and_resume() {
     let whole = extended(9).build().unwrap().run().unwrap();
@@ -265,7 +264,7 @@ fn parts_from_outside_train_and_resume() {
     assert!(dim.len() == points + 1 && dim.iter().any(|dim| *dim != 0.0));
     let gains = whole.hook::<Exposure>().unwrap().gains();
     assert!(gains.iter().any(|gain| *gain != 0.0));
-    // Quaternions took no step.
+    // The quaternions were not stepped.
     assert_eq!(whole.model.to_data().quats[5], [1.0, 0.0, 0.0, 0.0]);
 
     let stop = Arc::new(AtomicBool::new(false));
@@ -295,7 +294,7 @@ fn parts_from_outside_train_and_resume() {
     assert!(twice.contains("named `exposure`"), "{twice}");
 }
 
-/// The mean over several views is that of the views one by one.
+/// The mean over several views equals the mean of individual views.
 #[test]
 fn a_step_of_several_views_is_along_their_mean() {
     let run = |views: usize, steps: usize| {
@@ -309,7 +308,7 @@ fn a_step_of_several_views_is_along_their_mean() {
     let (single, double) = (run(1, 1), run(2, 2));
     let first = f64::from(double.history.losses[0].total);
     let one = f64::from(single.history.losses[0].total);
-    // The first of the two views is that of the run with one; the loss is the mean of both.
+    // The first of the two views is that of the single-view run; the loss is the mean of both.
     assert!(
         (first - one).abs() > 1e-6 && (first / one - 1.0).abs() < 0.5,
         "{first} {one}"
@@ -318,8 +317,7 @@ fn a_step_of_several_views_is_along_their_mean() {
     assert!(double.history.losses[1].total < double.history.losses[0].total * 1.2);
 }
 
-/// Told between its steps, a run waits, takes single steps, gives its scene, keeps its state and
-/// ends.
+/// By command, a run waits, takes single steps, sends its scene, saves its state and ends.
 #[test]
 fn a_run_does_what_it_is_told() {
     fn is_send<T: Send>(value: T) -> T {
@@ -357,7 +355,7 @@ fn a_run_does_what_it_is_told() {
     let trained = run.join().unwrap().unwrap();
     assert_eq!((trained.steps, &*kept.lock().unwrap()), (2, &vec![2]));
 
-    // Nobody there to command is no command.
+    // A queue without a sender gives no commands.
     let (_, queue) = command_queue();
     let config = TrainSettings {
         steps: 2,
@@ -372,7 +370,7 @@ fn a_run_does_what_it_is_told() {
     assert_eq!(trained.unwrap().steps, 2);
 }
 
-/// Does one thing wrong, or grows by screen gradients alone.
+/// Makes one mistake, or grows by screen gradients alone.
 #[derive(Clone, Copy, PartialEq)]
 enum Wrong {
     WideTerm,
@@ -428,7 +426,7 @@ impl Strategy<Gaussians> for Wrong {
     }
 }
 
-/// What a strategy must not do ends the run by name, and nothing of a half step is kept.
+/// A strategy's mistake ends the run with an error that names it, and no half step is saved.
 #[test]
 fn what_a_strategy_must_not_do_is_named() {
     let run = |strategy: Wrong| {
@@ -463,7 +461,7 @@ fn what_a_strategy_must_not_do_is_named() {
     assert!(message.contains("before the model"), "{message}");
 }
 
-/// Density control grows by the gradients of views, however many of them a step has.
+/// Density control grows by the gradients of single views, however many a step has.
 #[test]
 fn density_control_sees_the_gradient_of_a_view_whatever_the_views_of_a_step() {
     struct Sums(Arc<Mutex<Vec<f32>>>);
@@ -498,8 +496,7 @@ fn density_control_sees_the_gradient_of_a_view_whatever_the_views_of_a_step() {
     assert!((four / one - 1.0).abs() < 1e-4, "{one} {four}");
 }
 
-/// Numbers of hooks come back to the last bit, and a run goes on with the hooks that it was begun
-/// with.
+/// Numbers of hooks are restored exactly, and a run resumes only with its original hooks.
 #[test]
 fn hooks_are_part_of_the_run() {
     struct Number(f64);
@@ -544,7 +541,7 @@ fn hooks_are_part_of_the_run() {
     assert!(message.contains("the hooks [\"number\"]"), "{message}");
 }
 
-/// A step more than the run has is an error, and its state can be kept between steps.
+/// A step beyond the run's last is an error, and the state can be saved between steps.
 #[test]
 fn whoever_drives_the_loop_ends_with_it() {
     let mut trainer = builder()

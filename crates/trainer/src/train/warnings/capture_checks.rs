@@ -1,4 +1,4 @@
-//! What looks wrong before the first step: points, cameras, photos, settings.
+//! Checks before the first step: points, cameras, photos, settings.
 
 use std::collections::HashSet;
 
@@ -10,37 +10,38 @@ use super::{Warning, median, quantile};
 use crate::train::TrainSettings;
 use splat_data::{Capture, View};
 
-/// Points that share a place are a warning from this share of all on: matches found twice are a few
-/// percent.
+/// Share of coincident points from which a warning is issued; double matches are a few percent.
 const COINCIDENT: f64 = 0.5;
-/// Half of the points lie within this share of the cameras' distance: under a tenth of a degree, a
-/// few pixels of a photo, where nothing can be seen of them.
+/// Share of the cameras' distance within which half of the points lie: below a tenth of a degree, a
+/// few pixels of a photo, nothing can be seen of them.
 const COMPACT: f64 = 1e-3;
-/// Median standard deviation over the cameras' distance. A splat is visible over about three
-/// standard deviations to either side, at a quarter wider than a picture of 70 degrees; points of
-/// real captures give about 0.005.
+/// Median standard deviation relative to the cameras' distance. A splat is visible over about three
+/// standard deviations to either side, so at a quarter it is wider than a picture of 70 degrees;
+/// points of real captures give about 0.005.
 const LARGE: f64 = 0.25;
-/// Cameras are compared with each other where there are at least this many; of fewer none is usual.
+/// Smallest number of cameras that are compared; among fewer, none is typical.
 const COMPARABLE: usize = 4;
-/// A camera stands among the points where the nearest percent is below this share of its usual
-/// distance (real captures stay above 0.4), and half of the points below [`INSIDE_MIDDLE`] of
-/// theirs. A close-up has the first alone; the cameras in a room neither, being all alike.
+/// A camera is among the points if the nearest percent is closer than this share of the usual
+/// distance (real captures stay above 0.4), and half of the points closer than [`INSIDE_MIDDLE`] of
+/// theirs. A close-up meets only the first condition; cameras in a room meet neither, being all
+/// alike.
 const INSIDE_NEAR: f64 = 0.25;
 /// See [`INSIDE_NEAR`].
 const INSIDE_MIDDLE: f64 = 0.6;
-/// A camera is far away from this multiple of the usual distance on; real captures stay below 1.3.
+/// Multiple of the usual distance from which a camera is far away; real captures stay below 1.3.
 const FAR: f64 = 5.0;
-/// A camera sees few points below this share of what is usual; real captures stay above 0.35.
+/// Share of the usual number of points below which a camera sees few; real captures stay above
+/// 0.35.
 const FEW: f64 = 0.1;
-/// Correlation of neighbouring pixels, below which a photo is noise: noise has 0 within 0.05,
-/// photos of real scenes 0.6 or more, even at an eighth of their size.
+/// Correlation of neighbouring pixels below which a photo is noise. Noise has 0 within 0.05; photos
+/// of real scenes have 0.6 or more, even at an eighth of their size.
 const NOISE: f64 = 0.2;
-/// So many rows of a photo are enough to tell noise.
+/// Rows of a photo examined for noise.
 const NOISE_ROWS: u32 = 64;
-/// Rates from this multiple of the default on are high: more than tuning to a scene asks for.
+/// Multiple of the default from which a rate is high: more than tuning to a scene needs.
 const HIGH_RATE: f64 = 5.0;
 
-/// Everything that looks wrong.
+/// All warnings about the capture and the settings.
 pub(in crate::train) fn inspect(
     capture: &Capture,
     splats: &SplatData,
@@ -66,11 +67,11 @@ pub(in crate::train) fn inspect(
     warnings
 }
 
-/// Where the points are, as one camera has them.
+/// The points as seen by one camera.
 struct Outlook {
-    /// Distance within which 1 % of the points lie.
+    /// Distance that includes 1 % of the points.
     near: f64,
-    /// Distance within which half of the points lie.
+    /// Distance that includes half of the points.
     middle: f64,
     /// Number of points that fall into the photo.
     seen: usize,
@@ -95,7 +96,7 @@ impl Outlook {
 
 fn crowded(positions: &[DVec3], origin: DVec3, distance: f64) -> Option<Warning> {
     let points = positions.len();
-    // As the model has them, from its origin and in single precision.
+    // As in the model: relative to its origin and in single precision.
     let places: HashSet<_> = positions
         .iter()
         .map(|p| (*p - origin).as_vec3().to_array().map(f32::to_bits))
@@ -107,7 +108,7 @@ fn crowded(positions: &[DVec3], origin: DVec3, distance: f64) -> Option<Warning>
     let axis = |get: fn(&DVec3) -> f64| median(positions.iter().map(get));
     let middle = DVec3::new(axis(|p| p.x), axis(|p| p.y), axis(|p| p.z));
     let radius = median(positions.iter().map(|p| p.distance(middle)));
-    // One point or two have no extent to judge.
+    // One or two points have no extent to judge.
     (points > 2 && radius < COMPACT * distance)
         .then_some(Warning::CompactPoints { radius, distance })
 }
@@ -123,7 +124,7 @@ fn large(splats: &SplatData, config: &TrainSettings, distance: f64) -> Option<Wa
     })
 }
 
-/// Each odd camera once: for where it stands, or else for what it sees.
+/// Reports each odd camera once: for its position, or else for what it sees.
 fn cameras(capture: &Capture, outlooks: &[Outlook]) -> Vec<Warning> {
     if outlooks.len() < COMPARABLE {
         return Vec::new();
@@ -176,7 +177,7 @@ fn noise(views: &[View]) -> Option<Warning> {
     })
 }
 
-/// Whether neighbours in a row of the photo's green channel are uncorrelated. A photo of one colour
+/// True if neighbours in a row of the photo's green channel are uncorrelated. A photo of one colour
 /// is not noise.
 fn is_noise(view: &View) -> bool {
     let width = view.width as usize;
@@ -198,7 +199,7 @@ fn is_noise(view: &View) -> bool {
     let pairs = rows.iter().flat_map(|row| row.windows(2));
     let covariance = pairs.map(|p| (p[0] - mean) * (p[1] - mean)).sum::<f64>()
         / (rows.len() * (width - 1)) as f64;
-    // Half a level of 8 bits: less is a flat photo and its rounding.
+    // Variance of half an 8-bit level; less is a flat photo with rounding.
     variance > 0.25 && covariance < NOISE * variance
 }
 

@@ -1,28 +1,29 @@
-//! What looks wrong in the losses so far, looked at after every quarter of a run.
+//! Checks of the losses, after every quarter of a run.
 
 use super::{Warning, median};
 use crate::train::LossRecord;
 
-/// A view is judged by at least this many of its losses: the median of fewer may be one bad step.
+/// Smallest number of losses by which a view is judged; the median of fewer may be a single bad
+/// step.
 const VISITS: usize = 3;
-/// Views are compared with each other where there are at least this many; of fewer none is usual.
+/// Smallest number of views that are compared; among fewer, none is typical.
 const COMPARABLE: usize = 4;
-/// A view is hard from this multiple of the usual loss on, if it also stands out by [`HARD_SPREAD`]
-/// and has not fallen below [`STAYS`]: views that are merely harder than others reach 2.0, but
-/// their loss falls.
+/// Multiple of the usual loss from which a view is hard, if it also exceeds [`HARD_SPREAD`] and has
+/// not fallen below [`STAYS`]. Views that are merely harder than others reach 2.0, but their loss
+/// falls.
 const HARD: f64 = 1.75;
-/// Median deviations of the views' losses between a hard view and the usual one.
+/// Distance of a hard view from the usual one, in median deviations of the views' losses.
 const HARD_SPREAD: f64 = 8.0;
-/// The loss rises from this multiple of its least on. Rows that were just split raise it by 1.35
-/// for some steps.
+/// Multiple of its minimum from which the loss is rising. Rows that were just split raise it by
+/// 1.35 for some steps.
 const RISES: f64 = 1.5;
-/// A loss does not fall from this share of the first on; that of a real capture halves in a few
+/// Share of the first loss above which it has not fallen; in a real capture it halves in a few
 /// hundred steps.
 const STAYS: f64 = 0.9;
-/// Losses are compared where there are at least this many at each time.
+/// Smallest number of losses that are compared at each time.
 const STEPS: usize = 25;
 
-/// The losses of a run at a point of it.
+/// The losses of a run up to a step.
 pub(in crate::train) struct Course<'a> {
     /// Every step whose loss was finite, in order.
     pub losses: &'a [LossRecord],
@@ -32,14 +33,14 @@ pub(in crate::train) struct Course<'a> {
     pub steps: usize,
 }
 
-/// Whether a run is to be looked at after this step.
+/// True if a run is checked after this step.
 pub(in crate::train) fn is_due(step: usize, steps: usize) -> bool {
     step == steps || (1..4).any(|quarter| step == steps * quarter / 4)
 }
 
 impl Course<'_> {
-    /// Everything that looks wrong. `view_at` names the view of a step (from 0), by an index below
-    /// `views`; `name` gives its photo. With 0 views none is judged.
+    /// All warnings about the losses. `view_at` returns the view of a step (from 0), as an index
+    /// below `views`; `name` gives its photo. With 0 views none is judged.
     pub(in crate::train) fn inspect(
         &self,
         views: usize,
@@ -58,13 +59,13 @@ impl Course<'_> {
         &self.losses[index(from)..index(to)]
     }
 
-    /// Median loss of the steps in (from, to]; none of too few.
+    /// Median loss of the steps in (from, to]; `None` if there are too few.
     fn level(&self, from: usize, to: usize) -> Option<f64> {
         let losses = self.between(from, to);
         (losses.len() >= STEPS).then(|| median(losses.iter().map(total)))
     }
 
-    /// By the latter half of the steps so far, as views that were visited early have fallen less.
+    /// Uses the later half of the steps so far, as views that were visited early have fallen less.
     fn hard_views(
         &self,
         views: usize,
@@ -121,7 +122,7 @@ impl Course<'_> {
         })
     }
 
-    /// Judged at the end alone.
+    /// Judged at the end only.
     fn does_not_fall(&self) -> Option<Warning> {
         if self.step < self.steps || self.steps < 4 * STEPS {
             return None;
@@ -147,7 +148,7 @@ mod tests {
     const STEPS: usize = 400;
     const VIEWS: usize = 10;
 
-    /// What is found at the end of a run in which step `step` (from 0) had a loss.
+    /// Warnings at the end of a run in which step `step` (from 0) had a given loss.
     fn found(loss: impl Fn(usize) -> f32) -> Vec<Warning> {
         let losses: Vec<LossRecord> = (0..STEPS)
             .map(|step| LossRecord {
