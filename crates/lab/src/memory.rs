@@ -1,7 +1,7 @@
-//! How much memory the program has used.
+//! Memory use of the process.
 
-/// Most memory of this process that was ever resident, in bytes. Known on Linux (`VmHWM` of
-/// `/proc/self/status`), `None` elsewhere.
+/// Peak resident memory of this process in bytes, on Linux (`VmHWM` of `/proc/self/status`); `None`
+/// elsewhere.
 pub fn peak_rss_bytes() -> Option<u64> {
     parse(&std::fs::read_to_string("/proc/self/status").ok()?)
 }

@@ -1,5 +1,5 @@
-//! Training on a CubeCL device: the same bits however often it is repeated, and the memory that is
-//! stated. In a process of its own, one test after the other, because the allocator counts for all.
+//! Training on a CubeCL device: reproducible bits, and the documented memory. A process of its own
+//! with serialised tests, as the allocator's count is process-wide.
 #![cfg(all(feature = "cpu", feature = "wgpu"))]
 
 use std::path::Path;
@@ -15,18 +15,18 @@ use splat_trainer::{TrainSettings, Trained, Trainer};
 
 static ALONE: Mutex<()> = Mutex::new(());
 
-/// wgpu's adapter, a software one included; `None`, loudly, where there is none.
+/// wgpu's adapter, a software one included. Prints a message and returns `None` if there is none.
 fn adapter() -> Option<(MutexGuard<'static, ()>, Device)> {
     static ADAPTER: std::sync::OnceLock<Option<Device>> = std::sync::OnceLock::new();
     let guard = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
-    // A process can open it once.
+    // A process can open the device only once.
     let device = ADAPTER.get_or_init(|| adapter_or_skip(Device::wgpu_options().init()));
     Some((guard, device.clone()?))
 }
 
 const STEPS: usize = 24;
 
-/// The example capture at 20 x 30 pixels, with one in forty of its points.
+/// The example capture at 20 x 30 pixels, with one point in forty.
 fn capture() -> Arc<Capture> {
     let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
     let mut capture = Capture::load(
@@ -41,7 +41,7 @@ fn capture() -> Arc<Capture> {
     Arc::new(capture)
 }
 
-/// A run with two refinements, at steps 8 and 12, and a reset of opacities.
+/// A run with refinements at steps 8 and 12, and a reset of opacities.
 fn train(capture: &Arc<Capture>, device: &Device, seed: u64) -> Trained {
     train_with(capture, device, seed, true)
 }
@@ -56,7 +56,7 @@ fn train_with(capture: &Arc<Capture>, device: &Device, seed: u64, deterministic:
     config.density.every = 4;
     config.density.reset_every = 8;
     config.density.grow_gradient = 1e-5;
-    // More than such small photos ask for.
+    // More than the default for such small photos.
     config.density.max_gaussians = Some(10_000);
     Trainer::builder(capture.clone())
         .settings(config)
@@ -67,7 +67,7 @@ fn train_with(capture: &Arc<Capture>, device: &Device, seed: u64, deterministic:
         .unwrap()
 }
 
-/// Every parameter of every Gaussian and every loss, bit for bit.
+/// Every parameter of every Gaussian and every loss, as bits.
 fn bits(trained: &Trained) -> Vec<(&'static str, Vec<u32>)> {
     let data = trained.model.to_data();
     let losses: Vec<f32> = trained.history.losses.iter().map(|r| r.total).collect();
@@ -113,7 +113,7 @@ fn ten_runs_of_one_seed_leave_the_same_bits() {
             );
         }
     }
-    // That bits are compared at all: another seed leaves others.
+    // Checks the comparison itself: another seed gives other bits.
     assert_ne!(bits(&train(&capture, &device, 8)), expected);
 }
 
@@ -123,7 +123,7 @@ fn gradients_without_order_train_alike_with_less_memory() {
         return;
     };
     let capture = capture();
-    // The room that lists are given depends on what was listed before.
+    // The room reserved for lists depends on earlier lists.
     train(&capture, &device, 7);
     let [ordered, unordered] = [true, false].map(|deterministic| {
         let before = kernel_work();
@@ -169,9 +169,9 @@ fn the_state_between_steps_takes_the_bytes_that_are_stated() {
     };
     let (at_rest, most) = (growth(|m| m.at_rest_bytes), growth(|m| m.most_bytes));
     println!("{small:?}\n{large:?}\nper Gaussian: {at_rest} at rest, {most} in a step");
-    // Nothing else grows with the Gaussians; a few bytes of alignment are not counted.
+    // Nothing else grows with the Gaussians; a few bytes of alignment are ignored.
     assert!((at_rest / PER_GAUSSIAN_AT_REST as f64 - 1.0).abs() < 0.01);
-    // In a step come the gradients, 236 bytes, what is projected, 36, colours, and the rest of what
-    // is kept for them.
+    // A step adds gradients (236 bytes), projected splats (36), colours, and the state kept for
+    // them.
     assert!(most > at_rest + 236.0, "{most}");
 }

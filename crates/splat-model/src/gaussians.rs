@@ -61,8 +61,8 @@ pub enum ShPrecision {
     /// In single precision.
     #[default]
     Exact,
-    /// In half precision, for rendering only. A Gaussian of degree 3 takes 146 bytes instead of 236,
-    /// and colours read 114 bytes instead of 204 (`docs/notes/half-precision.md`).
+    /// In half precision, for rendering only. A Gaussian of degree 3 takes 146 bytes instead of
+    /// 236, and colours read 114 bytes instead of 204 (`docs/notes/half-precision.md`).
     Half,
 }
 

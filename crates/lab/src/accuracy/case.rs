@@ -1,20 +1,20 @@
-//! What a hard case is.
+//! Definition of a hard case.
 
 use burn::tensor::Device;
 
 use super::measure::{AccuracyError, Outcome, against_double};
 use crate::gradcheck::Scene;
 
-/// A scene, or something else, that breaks naive splatting code.
+/// A scene, or another task, that breaks naive splatting code.
 #[derive(Clone, Copy)]
 pub struct Case {
     /// 1 to 38.
     pub number: u8,
-    /// In a few words.
+    /// Short description.
     pub name: &'static str,
-    /// What a naive kernel does with it.
+    /// The failure of a naive kernel.
     pub naive: &'static str,
-    /// What must hold, besides the relative L2 error of 1e-3.
+    /// Additional demand, besides the relative L2 error of 1e-3.
     pub demand: &'static str,
     pub(super) check: Check,
 }
@@ -22,15 +22,15 @@ pub struct Case {
 /// How a case is checked.
 #[derive(Clone, Copy)]
 pub(super) enum Check {
-    /// Image, alpha and every gradient of these scenes against double precision. The named groups
-    /// have a gradient of zero by symmetry.
+    /// Compares image, alpha and every gradient of these scenes with double precision. The named
+    /// groups have a gradient of zero by symmetry.
     Scenes(fn() -> Vec<Scene>, &'static [&'static str]),
-    /// In its own way.
+    /// Checked by its own function.
     Own(fn(&Device) -> Result<Outcome, AccuracyError>),
 }
 
 impl Case {
-    /// A case of scenes whose every error must be below 1e-3.
+    /// A case of scenes, each with errors below 1e-3.
     pub(super) const fn scenes(
         number: u8,
         name: &'static str,
@@ -66,7 +66,7 @@ impl Case {
     /// Measures the case on `device` in single precision.
     ///
     /// # Errors
-    /// When the device or an op refuses what it should take. An inaccurate result is no error.
+    /// When the device or an op refuses valid input. An inaccurate result is not an error.
     pub fn measure(&self, device: &Device) -> Result<Outcome, AccuracyError> {
         match self.check {
             Check::Own(check) => check(device),
@@ -78,7 +78,7 @@ impl Case {
         }
     }
 
-    /// The scenes that stand for the case in timings; none where it is no matter of rendering.
+    /// Scenes for timing; empty if the case renders nothing.
     pub fn timed_scenes(&self) -> Vec<Scene> {
         match self.check {
             Check::Scenes(scenes, _) => scenes(),

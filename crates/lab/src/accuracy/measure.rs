@@ -1,4 +1,4 @@
-//! Measures one scene on one device in single precision against the CPU in double precision.
+//! Compares a scene in single precision on a device with double precision on the CPU.
 
 use burn::tensor::Device;
 use splat_ops::OpError;
@@ -7,7 +7,7 @@ use crate::gradcheck::{
     Array, Computed, Fixture, GradcheckError, Inputs, NEAR, Precision, Scene, compare, run, walk,
 };
 
-/// What keeps a case from being measured.
+/// Why a case cannot be measured.
 #[derive(Debug, thiserror::Error)]
 pub enum AccuracyError {
     /// A scene could not be run.
@@ -21,27 +21,27 @@ pub enum AccuracyError {
     Read(String),
 }
 
-/// How a case went on one device.
+/// Result of a case on one device.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Outcome {
-    /// Relative L2 error of the image (or of what takes its place).
+    /// Relative L2 error of the image (or of its substitute).
     pub forward: f64,
     /// Relative L2 error of the worst parameter group.
     pub gradient: f64,
-    /// That group.
+    /// Name of that group.
     pub worst_group: String,
-    /// Pixels within 1e-6 of a threshold, which one rounding error may flip.
+    /// Pixels within 1e-6 of a threshold, which rounding may flip.
     pub near_threshold: usize,
     /// (Pixel, splat) pairs blended.
     pub blended: u64,
-    /// What else was found.
+    /// Additional findings.
     pub detail: String,
-    /// Whether the case's demand holds.
+    /// True if the case's demand holds.
     pub holds: bool,
 }
 
 impl Outcome {
-    /// Nothing measured yet, and nothing wrong.
+    /// No measurements and no failures.
     pub(super) fn new() -> Self {
         Self {
             holds: true,
@@ -70,7 +70,7 @@ impl Outcome {
         self
     }
 
-    /// Demands something more; `what` says so where it does not hold.
+    /// Adds a demand; `what` describes it if it does not hold.
     pub(super) fn demand(mut self, holds: bool, what: impl Into<String>) -> Self {
         if !holds {
             self.holds = false;
@@ -91,18 +91,18 @@ impl Outcome {
     }
 }
 
-/// Single precision on `device`.
+/// The scene in single precision on `device`.
 pub(super) fn single(scene: &Scene, device: &Device) -> Result<Computed, AccuracyError> {
     Ok(run(scene, device, Precision::F32, None)?)
 }
 
-/// Double precision on the CPU.
+/// The scene in double precision on the CPU.
 pub(super) fn double(scene: &Scene) -> Result<Computed, AccuracyError> {
     Ok(run(scene, &Device::flex(), Precision::F64, None)?)
 }
 
-/// Image, alpha and every gradient of `scene` on `device` in single precision, against double
-/// precision; groups named in `zero` have a gradient of zero by symmetry, which rounding hides.
+/// Compares image, alpha and every gradient of `scene` in single precision on `device` with double
+/// precision. Groups named in `zero` have a gradient of zero by symmetry, hidden by rounding.
 pub(super) fn against_double(
     scene: &Scene,
     device: &Device,
@@ -167,7 +167,7 @@ fn group<'a>(inputs: &'a mut Inputs, name: &str) -> Option<&'a mut Array> {
     })
 }
 
-/// All gradients of a scene, one after the other.
+/// All gradients of a scene, concatenated.
 pub(super) fn gradients(computed: &Computed) -> Vec<f64> {
     let g = &computed.gradients;
     [
@@ -185,14 +185,14 @@ pub(super) fn gradients(computed: &Computed) -> Vec<f64> {
     .collect()
 }
 
-/// The first scene of `make`, by seed, whose every pixel keeps a relative distance of `margin` to
-/// every threshold in double precision: what remains is rounding error, not the flip of a pixel.
-/// The last one tried if none does.
+/// The first scene of `make`, by seed, in which every pixel keeps a relative distance of `margin`
+/// from every threshold in double precision, so that only rounding error is measured. The last one
+/// tried if there is none.
 pub(super) fn clear(margin: f64, make: impl Fn(u64) -> Scene) -> Scene {
     clear_but(0, margin, make)
 }
 
-/// [`clear`], with up to `near` pixels that may be near a threshold: those that a case puts there.
+/// [`clear`], allowing `near` pixels near a threshold that the case puts there on purpose.
 pub(super) fn clear_but(near: usize, margin: f64, make: impl Fn(u64) -> Scene) -> Scene {
     const SEEDS: u64 = 200;
     let is_clear = |scene: &Scene| {

@@ -1,7 +1,7 @@
-//! How far pictures and gradients are from the truth, where it is hard: every case that breaks
-//! naive splatting code, in single precision on any device against double precision on the CPU
-//! (which is itself held to PyTorch, see [`crate::gradcheck`]); and how far the affine projection
-//! is from the 3D model, which is no matter of rounding.
+//! Accuracy of images and gradients on hard cases: every case that breaks naive splatting code, in
+//! single precision on any device against double precision on the CPU (which is itself checked
+//! against PyTorch, see [`crate::gradcheck`]). Also the deviation of the affine projection from the
+//! 3D model, which is not a matter of rounding.
 //!
 //! ```text
 //! cases/ (scenes by sketch.rs) ──case──> measure (f32 on a device, f64 on the CPU) ──> Outcome ──report──> table, JSON, SVG

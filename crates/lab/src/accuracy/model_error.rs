@@ -1,18 +1,20 @@
-//! Model error apart from rounding error: how far the affine (EWA) projection is from the 3D model.
+//! Model error, as opposed to rounding error: the deviation of the affine (EWA) projection from the
+//! 3D model.
 //!
-//! The rasteriser draws each Gaussian as a Gaussian on the screen: its density summed along lines,
-//! with the perspective at its mean taken for that of all of it (3DGS eq. 5; Zwicker et al. 2001).
-//! The reference here makes no such approximation. A pixel's ray from the camera centre o in the
-//! unit direction d meets a Gaussian of mean mu and covariance Sigma = R diag(s^2) R^T with
+//! The rasteriser draws each Gaussian as a Gaussian on the screen: its density integrated along
+//! lines, with the perspective at its mean applied to all of it (3DGS eq. 5; Zwicker et al. 2001).
+//! The reference here makes no such approximation. The ray of a pixel from the camera centre o in
+//! the unit direction d meets a Gaussian of mean mu and covariance Sigma = R diag(s^2) R^T with
 //!
 //! ```text
 //! falloff(d) = I(d) / I(d0),   I(d) = integral over t of exp(-(o + t d - mu)^T Sigma^-1 (o + t d - mu) / 2)
 //! ```
 //!
-//! d0 being the direction through the mean. It is the integral, not the peak along the ray, because
-//! the screen Gaussian of EWA is the marginal of the 3D one along the line of sight, scaled to 1 at
-//! the mean: where the perspective is affine the two are equal, elsewhere they differ by the model.
-//! With w(v) = diag(1/s) R^T v, wd = w(d) and wm = w(mu - o) it has a closed form,
+//! Here d0 is the direction through the mean. The integral is used, not the peak along the ray,
+//! because the screen Gaussian of EWA is the marginal of the 3D Gaussian along the line of sight,
+//! scaled to 1 at the mean: the two are equal where the perspective is affine, and otherwise differ
+//! by the model error. With w(v) = diag(1/s) R^T v, wd = w(d) and wm = w(mu - o) it has a closed
+//! form,
 //!
 //! ```text
 //! falloff(d) = sqrt(|w(d0)|^2 / |wd|^2) exp(-|wd x wm|^2 / (2 |wd|^2))
@@ -20,16 +22,16 @@
 //!
 //! whose exponent, the squared distance at which the ray passes the mean, is not a difference and
 //! so keeps its digits. Two consequences:
-//! - the falloff may exceed 1: a ray that runs along a needle meets more of it than the one through
-//!   its mean does. Alpha is capped as ever.
-//! - the integral is over the whole line, as EWA's is. Of a Gaussian whose mean is 4 standard
+//! - The falloff may exceed 1: a ray along a needle meets more of it than the ray through its mean.
+//!   Alpha is capped as usual.
+//! - The integral is over the whole line, like EWA's. For a Gaussian whose mean is 4 standard
 //!   deviations away along the ray, less than 4e-5 lies behind the camera.
 //!
 //! Depth order (camera z of the mean), `alpha_min`, `alpha_max`, early stop and background are
-//! those of [`splat_ops::rasterize`]. There is no low-pass filter: a pixel is a point. Compare with
-//! [`render_affine`] at `eps2d` 0 for the model alone, at 0.3 for model and filter.
+//! those of [`splat_ops::rasterize()`]. There is no low-pass filter: a pixel is a point. Compare
+//! with [`render_affine`] at `eps2d` 0 for the model alone, and at 0.3 for model and filter.
 //!
-//! A measuring tool: no gradients, every Gaussian at every pixel.
+//! A measuring tool: no gradients, and every Gaussian at every pixel.
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use glam::{DMat3, DQuat, DVec3};
@@ -38,39 +40,39 @@ use serde::Serialize;
 use splat_model::Camera;
 use splat_ops::{ImageSize, OpError, ProjectSettings, RasterizeSettings, project, rasterize};
 
-/// A Gaussian in the world, after the activations of the model.
+/// A Gaussian in the world, after activation.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Gaussian3d {
     /// Centre.
     pub mean: DVec3,
-    /// Axes to world; of any length but 0.
+    /// Rotation from its axes to the world, of any non-zero length.
     pub rotation: DQuat,
     /// Standard deviations along the axes, world units.
     pub scale: DVec3,
-    /// In (0, 1).
+    /// Opacity in (0, 1).
     pub opacity: f64,
-    /// Seen from the camera.
+    /// Colour seen from the camera.
     pub color: DVec3,
 }
 
-/// A picture in double precision, row by row from the top left.
+/// An image in double precision, row by row from the top left.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Picture {
-    /// In pixels.
+    /// Size in pixels.
     pub size: ImageSize,
     /// `[H * W]`.
     pub image: Vec<DVec3>,
-    /// `[H * W]`: one minus the light that is left.
+    /// `[H * W]`: one minus the remaining transmittance.
     pub alpha: Vec<f64>,
 }
 
-/// A device that cannot measure, or an op that refuses.
+/// Why the model error cannot be measured.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelErrorFailure {
     /// Single precision would mix rounding into the model error.
     #[error("{device} does not compute in double precision; measure on the CPU (Flex)")]
     NoDoublePrecision {
-        /// Its name.
+        /// Name of the device.
         device: String,
     },
     /// An op refused its input.
@@ -81,7 +83,7 @@ pub enum ModelErrorFailure {
     ReadBack(String),
 }
 
-/// A Gaussian as the camera sees it, with the camera at the origin.
+/// A Gaussian relative to the camera at the origin.
 struct Seen {
     /// diag(1/s) R^T, from camera axes.
     whiten: DMat3,
@@ -110,8 +112,8 @@ impl Seen {
         }
     }
 
-    /// Of a unit direction in camera axes. NaN where the Gaussian has a field that is not finite or
-    /// no extent.
+    /// Falloff in a unit direction in camera space. NaN if the Gaussian has a field that is not
+    /// finite or no extent.
     fn falloff(&self, direction: DVec3) -> f64 {
         let along = self.whiten * direction;
         let length2 = along.length_squared();
@@ -122,8 +124,8 @@ impl Seen {
 
 /// Renders by integrating every Gaussian along every pixel's ray.
 ///
-/// Gaussians nearer than `near` or beyond `far` (camera z of the mean), and those with a field that
-/// is not finite or a scale of zero, are not drawn.
+/// Gaussians nearer than `near` or farther than `far` (camera z of the mean), and those with a
+/// non-finite field or a scale of zero, are not drawn.
 pub fn render_rays(
     gaussians: &[Gaussian3d],
     camera: &Camera,
@@ -167,7 +169,7 @@ fn blend(
     let mut transmittance = 1.0;
     for splat in seen {
         let raw = splat.opacity * splat.falloff(direction);
-        // NaN is not seen.
+        // NaN is skipped.
         if !(raw >= settings.alpha_min) {
             continue;
         }
@@ -182,7 +184,7 @@ fn blend(
     (color + background * transmittance, 1.0 - transmittance)
 }
 
-/// Renders with the ops, in double precision: the affine approximation of the same scene.
+/// Renders the same scene with the ops, in double precision: the affine approximation.
 ///
 /// # Errors
 /// When the device lacks double precision, or an op refuses its input.
@@ -247,9 +249,9 @@ pub fn render_affine(
     })
 }
 
-/// Shape of a measured Gaussian, turned so that two of its axes lie at 45 degrees to the line of
-/// sight: on the optical axis, what stands along or across that line hides the part of the error
-/// that is linear in its size.
+/// Shape of a measured Gaussian, rotated so that two of its axes are at 45 degrees to the line of
+/// sight. On the optical axis, axes along or across that line would hide the error that is linear
+/// in the size.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Shape {
@@ -262,7 +264,7 @@ pub enum Shape {
 }
 
 impl Shape {
-    /// All of them.
+    /// All shapes.
     pub const ALL: [Self; 3] = [Self::Sphere, Self::Needle, Self::Pancake];
 
     /// Standard deviations, the largest being 1.
@@ -275,24 +277,24 @@ impl Shape {
     }
 }
 
-/// One Gaussian seen by itself, by both models.
+/// A single Gaussian in both models.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct ModelErrorRow {
     /// Its shape.
     pub shape: Shape,
-    /// From the camera to its mean, in units of its largest standard deviation.
+    /// Distance from the camera to its mean, in units of its largest standard deviation.
     pub distance: f64,
-    /// Between the optical axis and the direction to its mean, in degrees.
+    /// Angle between the optical axis and the direction to its mean, in degrees.
     pub angle: f64,
     /// Largest standard deviation on the screen of a sphere of this size, in pixels.
     pub pixels: f64,
     /// `|alpha affine - alpha rays| / |alpha rays|` over the pixels around it, without the low-pass
     /// filter: the model error.
     pub relative_l2: f64,
-    /// The largest difference of alpha at a pixel, likewise.
+    /// Largest difference of alpha at a pixel, without the low-pass filter.
     pub largest: f64,
-    /// The same as `relative_l2`, with the default low-pass filter in the affine model only: what a
-    /// user sees. Falls with `pixels`.
+    /// `relative_l2` with the default low-pass filter in the affine model only: what a user sees.
+    /// Falls with `pixels`.
     pub relative_l2_filtered: f64,
 }
 
@@ -308,7 +310,7 @@ pub const PIXELS: [f64; 3] = [1.0, 3.0, 9.0];
 /// Measures every [`Shape`] at all of [`DISTANCES`], [`ANGLES`] and [`PIXELS`].
 ///
 /// # Errors
-/// See [`render_affine`].
+/// Those of [`render_affine`].
 pub fn model_error_table(device: &Device) -> Result<Vec<ModelErrorRow>, ModelErrorFailure> {
     let mut rows = Vec::new();
     for shape in Shape::ALL {
@@ -326,21 +328,21 @@ pub fn model_error_table(device: &Device) -> Result<Vec<ModelErrorRow>, ModelErr
 /// Opacity of a measured Gaussian.
 const OPACITY: f64 = 0.9;
 
-/// The cut of alpha where models are compared: so low that no pixel's alpha falls from the default
-/// 1/255 to 0 in one model and not in the other.
+/// Alpha cut for comparing models, so low that no pixel's alpha is cut to 0 in one model only, as
+/// at the default of 1/255.
 const FAINTEST: f64 = 1e-9;
 
-/// Half the side of the picture around a measured Gaussian, in its standard deviations.
+/// Half side of the image around a measured Gaussian, in standard deviations.
 const WINDOW: f64 = 6.0;
 
-/// Measures one Gaussian: shape, distance in standard deviations, angle off the optical axis in
-/// degrees (below 90), size on the screen in pixels; see [`ModelErrorRow`].
+/// Measures one Gaussian by shape, distance in standard deviations, angle off the optical axis in
+/// degrees (below 90), and size on the screen in pixels; see [`ModelErrorRow`].
 ///
-/// The camera has its principal point where it must be for the Gaussian to lie in the middle of a
-/// small picture, so that the clamp of the Jacobian, which is relative to the picture, stays out.
+/// The principal point of the camera puts the Gaussian in the middle of a small image, so that the
+/// clamp of the Jacobian, which is relative to the image, has no effect.
 ///
 /// # Errors
-/// See [`render_affine`].
+/// Those of [`render_affine`].
 pub fn model_error(
     shape: Shape,
     distance: f64,

@@ -1,5 +1,4 @@
-//! How exact the projection of extreme Gaussians is in single precision, over as many random ones
-//! as one likes.
+//! Accuracy of the projection of random extreme Gaussians in single precision.
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use rand::{RngExt, SeedableRng};
@@ -15,24 +14,24 @@ const SIZE: ImageSize = ImageSize {
 };
 /// fx = fy, cx = cy.
 const INTRINSICS: [f64; 4] = [256.0, 256.0, 128.0, 128.0];
-/// Gaussians of one call.
+/// Gaussians per call.
 const BATCH: usize = 100_000;
-/// Relative distance to the edge of the view within which one rounding error may decide.
+/// Relative distance to the edge of the view within which rounding may decide.
 const EDGE: f64 = 1e-4;
 
-/// What the projection of random extreme Gaussians found.
+/// Errors of the projection of random extreme Gaussians.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize)]
 pub struct ProjectionErrors {
-    /// Gaussians tried: axes of 1e-4 to 1e4 pixels, up to 1e4 : 1, in every direction, quaternions
-    /// of any length.
+    /// Gaussians tested: axes of 1e-4 to 1e4 pixels, up to 1e4 : 1, in every direction, with
+    /// quaternions of any length.
     pub gaussians: usize,
-    /// Those that double precision sees.
+    /// Those visible in double precision.
     pub visible: usize,
-    /// Those of them, not at the very edge of the view, that single precision culls.
+    /// Visible ones, not at the very edge of the view, that single precision culls.
     pub culled_but_visible: usize,
     /// Largest relative error of the determinant of the screen covariance.
     pub determinant: f64,
-    /// Largest error of the exponent at a pixel that the splat reaches.
+    /// Largest error of the exponent at a pixel within the splat's reach.
     pub exponent: f64,
 }
 
@@ -83,7 +82,7 @@ impl ProjectionErrors {
     }
 }
 
-/// Whether the bounding box only just touches the picture.
+/// True if the bounding box barely touches the image.
 fn at_the_edge(row: &[f64]) -> bool {
     let sides = [f64::from(SIZE.width), f64::from(SIZE.height)];
     (0..2).any(|axis| {
@@ -99,7 +98,7 @@ fn exponent(row: &[f64], [x, y]: [f64; 2]) -> f64 {
     (z1 * z1 + z2 * z2) / 2.0
 }
 
-/// A random point of the picture where the splat's falloff is above 1/255: on its ridge, moved
+/// A random point in the image where the splat's falloff exceeds 1/255: on its ridge, displaced
 /// across it.
 fn on_the_splat(row: &[f64], rng: &mut Pcg64Mcg) -> Option<[f64; 2]> {
     let x: f64 = rng.random_range(0.0..f64::from(SIZE.width));
@@ -109,7 +108,7 @@ fn on_the_splat(row: &[f64], rng: &mut Pcg64Mcg) -> Option<[f64; 2]> {
     (inside && exponent(row, [x, y]) <= 255f64.ln()).then_some([x, y])
 }
 
-/// Gaussians, rounded to single precision.
+/// Gaussians rounded to single precision.
 struct Batch {
     count: usize,
     means: Vec<f32>,
@@ -135,7 +134,7 @@ impl Batch {
             batch
                 .quats
                 .extend((0..4).map(|_| (length * rng.random_range(-1.0..1.0)) as f32));
-            // The long axis in pixels, and the others up to 10,000 times shorter.
+            // The long axis in pixels; the others are up to 10,000 times shorter.
             let long = 10f64.powf(rng.random_range(0.0..4.0)) * depth / INTRINSICS[0];
             let mut axes = [0.0, -1.0, -1.0].map(|share: f64| {
                 let shorter = -share * rng.random_range(0.0..4.0);

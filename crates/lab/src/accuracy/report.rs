@@ -1,4 +1,4 @@
-//! Error beside time, for every case and backend: as rows, as a Markdown table, and as a picture.
+//! Error against time for every case and backend, as rows, a Markdown table, and a plot.
 
 use std::fmt::Write;
 use std::time::Instant;
@@ -11,29 +11,29 @@ use super::model_error::{ModelErrorRow, Shape, model_error_table};
 use super::projection::{ProjectionErrors, projection_errors};
 use super::{AccuracyError, Case, cases};
 
-/// Random extreme Gaussians that the projection is measured on.
+/// Random extreme Gaussians for measuring the projection.
 const GAUSSIANS: usize = 1_000_000;
-/// Runs of which the median time is taken.
+/// Number of runs for the median time.
 const RUNS: usize = 5;
 
-/// A device and its name.
+/// A named device.
 pub struct Backend {
-    /// Short: cpu, wgpu.
+    /// Short name: cpu, wgpu.
     pub name: String,
-    /// With the adapter's name.
+    /// Name with the adapter.
     pub description: String,
     /// The device.
     pub device: Device,
 }
 
-/// One case on one backend: a point of error against time.
+/// A case on a backend: one point of error against time.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
     /// Number of the case.
     pub case: u8,
     /// Its name.
     pub name: &'static str,
-    /// What must hold, besides the relative L2 error of 1e-3.
+    /// Additional demand, besides the relative L2 error of 1e-3.
     pub demand: &'static str,
     /// Backend.
     pub backend: String,
@@ -41,40 +41,40 @@ pub struct Row {
     pub forward: f64,
     /// Relative L2 error of the worst parameter group.
     pub gradient: f64,
-    /// That group.
+    /// Name of that group.
     pub worst_group: String,
-    /// Whether the case's demand holds.
+    /// True if the case's demand holds.
     pub holds: bool,
-    /// Seconds of forward and backward of the case's scenes, with upload and read-back; absent
-    /// where nothing is rendered.
+    /// Seconds of forward and backward pass of the case's scenes, with upload and read-back; absent
+    /// if nothing is rendered.
     pub seconds: Option<f64>,
     /// (Pixel, splat) pairs blended in that time, forward.
     pub blended: u64,
     /// Pixels within 1e-6 of a threshold.
     pub near_threshold: usize,
-    /// What else was found.
+    /// Additional findings.
     pub detail: String,
 }
 
-/// Everything that is measured.
+/// All measurements.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Report {
-    /// What it ran on.
+    /// The machine.
     pub machine: String,
     /// Cases by number, each on every backend.
     pub cases: Vec<Row>,
     /// The projection of extreme Gaussians, per backend.
     pub projection: Vec<(String, ProjectionErrors)>,
-    /// How far the affine projection is from the 3D model.
+    /// Deviation of the affine projection from the 3D model.
     pub model: Vec<ModelErrorRow>,
 }
 
 impl Report {
-    /// Measures everything; `each` hears of every case before it runs.
+    /// Measures everything; `each` is called before every case.
     ///
     /// # Errors
-    /// When a device or an op refuses what it should take. An inaccurate result is a row that does
-    /// not hold.
+    /// When a device or an op refuses valid input. An inaccurate result is a row that does not
+    /// hold.
     pub fn measure(
         backends: &[Backend],
         mut each: impl FnMut(&Backend, &Case),
@@ -261,7 +261,7 @@ fn measure(case: &Case, backend: &Backend) -> Result<Row, AccuracyError> {
     })
 }
 
-/// What the figures were measured on, as far as the system says.
+/// Description of the machine, as far as the system reports it.
 pub fn machine() -> String {
     let model = std::fs::read_to_string("/proc/cpuinfo")
         .ok()

@@ -1,5 +1,4 @@
-//! Builds scenes by what they look like: splats are placed at a pixel and a depth, and sized in
-//! pixels.
+//! Builds scenes by appearance: splats are placed at a pixel and a depth, and sized in pixels.
 
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
@@ -14,18 +13,18 @@ const SH_C0: f64 = 0.282_094_791_773_878_14;
 /// One Gaussian of a sketch.
 #[derive(Debug, Clone)]
 pub(crate) struct Blob {
-    /// World.
+    /// Centre in the world.
     pub mean: DVec3,
     /// (w, x, y, z)
     pub quat: [f64; 4],
-    /// World.
+    /// Standard deviations in the world.
     pub scale: [f64; 3],
     pub opacity: f64,
     /// 16 coefficients of three channels.
     pub sh: [[f64; 3]; 16],
 }
 
-/// A scene in the making: one pinhole camera, and splats before it.
+/// A scene under construction: a pinhole camera with splats in front of it.
 pub(crate) struct Sketch {
     pub name: &'static str,
     pub size: ImageSize,
@@ -43,7 +42,7 @@ pub(crate) struct Sketch {
 }
 
 impl Sketch {
-    /// An empty scene before a camera at the world's origin; focal length a power of two, the
+    /// An empty scene with a camera at the world's origin; the focal length is a power of two, the
     /// principal point in the middle.
     pub fn new(name: &'static str, width: u32, height: u32, seed: u64) -> Self {
         let focal = f64::from(width.max(height)).log2().round().exp2();
@@ -68,13 +67,13 @@ impl Sketch {
         }
     }
 
-    /// Turns and shifts the camera a little. To be done before splats are placed.
+    /// Rotates and shifts the camera a little. Call it before placing splats.
     pub fn tilted(mut self) -> Self {
         let axis = DVec3::from_array(std::array::from_fn(|_| self.uniform(-1.0, 1.0)));
         let angle = self.uniform(0.1, 0.4);
         let shift = DVec3::from_array(std::array::from_fn(|_| self.uniform(-0.5, 0.5)));
         let rotation = DMat3::from_quat(DQuat::from_axis_angle(axis.normalize(), angle));
-        // What is stored in single precision is the camera.
+        // The camera is the single-precision one.
         let mut viewmat = DMat4::from_mat3(rotation);
         viewmat.w_axis = shift.extend(1.0);
         self.viewmat = DMat4::from_cols_array(&viewmat.to_cols_array().map(rounded));
@@ -118,7 +117,7 @@ impl Sketch {
         }
     }
 
-    /// Adds a splat with random colours at a pixel; axes in pixels at its depth.
+    /// Adds a splat with random colours at a pixel, with axes in pixels at its depth.
     pub fn splat(
         &mut self,
         pixel: [f64; 2],
@@ -139,8 +138,8 @@ impl Sketch {
         &mut self.blobs[last]
     }
 
-    /// Adds `count` random splats all over the picture, axes of 1 to 4 pixels, well separated in
-    /// depth.
+    /// Adds `count` random splats over the whole image, with axes of 1 to 4 pixels, well separated
+    /// in depth.
     pub fn scatter(&mut self, count: usize, opacity: (f64, f64)) {
         let (width, height) = (f64::from(self.size.width), f64::from(self.size.height));
         let mut depths: Vec<f64> = (0..count)
@@ -162,7 +161,7 @@ impl Sketch {
         }
     }
 
-    /// The scene, every value rounded to single precision, with random upstream gradients.
+    /// The scene, with every value rounded to single precision and random upstream gradients.
     pub fn scene(mut self) -> Scene {
         let n = self.blobs.len();
         let (h, w) = (self.size.height as usize, self.size.width as usize);
@@ -217,17 +216,17 @@ impl Sketch {
     }
 }
 
-/// To the nearest single.
+/// Rounds to single precision.
 pub(super) fn rounded(value: f64) -> f64 {
     f64::from(value as f32)
 }
 
-/// A turn about the camera's axis.
+/// A rotation about the camera's axis.
 pub(super) fn about_z(angle: f64) -> [f64; 4] {
     [(angle / 2.0).cos(), 0.0, 0.0, (angle / 2.0).sin()]
 }
 
-/// The next single up, and the next one down.
+/// The next larger and the next smaller f32.
 pub(crate) fn neighbours(value: f64) -> [f64; 2] {
     let value = value as f32;
     [f64::from(value.next_down()), f64::from(value.next_up())]

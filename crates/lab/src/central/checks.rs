@@ -1,9 +1,9 @@
-//! What must hold before a gradient can be checked.
+//! Preconditions of a gradient check.
 
 use super::{CheckError, Inputs, Settings};
 use crate::gradcheck::{Array, index_of};
 
-/// Inputs are there, have elements that are finite, and names of their own.
+/// Checks that inputs exist, have finite elements, and distinct names.
 pub(super) fn check_inputs(inputs: &Inputs) -> Result<(), CheckError> {
     if inputs.entries.is_empty() {
         return Err(CheckError::Inputs("there are none".into()));
@@ -35,7 +35,7 @@ pub(super) fn check_inputs(inputs: &Inputs) -> Result<(), CheckError> {
     Ok(())
 }
 
-/// Numbers are in their range and names are those of inputs.
+/// Checks that numbers are in range and names are those of inputs.
 pub(super) fn check_settings(settings: &Settings, inputs: &Inputs) -> Result<(), CheckError> {
     let positive = [
         ("tolerance", settings.tolerance),
@@ -64,7 +64,7 @@ pub(super) fn check_settings(settings: &Settings, inputs: &Inputs) -> Result<(),
     Ok(())
 }
 
-/// Outputs are finite.
+/// Checks that outputs are finite.
 pub(super) fn check_outputs(outputs: &[Array]) -> Result<(), CheckError> {
     for (output, array) in outputs.iter().enumerate() {
         if let Some((at, value)) = not_finite(&array.values, &array.shape) {
@@ -74,8 +74,8 @@ pub(super) fn check_outputs(outputs: &[Array]) -> Result<(), CheckError> {
     Ok(())
 }
 
-/// Both evaluations agree to nine digits of the largest element: the pass with gradients may sum in
-/// another order.
+/// Checks that both evaluations agree to nine digits of the largest element; the pass with
+/// gradients may sum in another order.
 pub(super) fn check_repeats(outputs: &[Array], again: &[Array]) -> Result<(), CheckError> {
     for (output, (first, second)) in outputs.iter().zip(again).enumerate() {
         let most = first
@@ -83,7 +83,7 @@ pub(super) fn check_repeats(outputs: &[Array], again: &[Array]) -> Result<(), Ch
             .iter()
             .fold(0.0, |most: f64, x| most.max(x.abs()));
         let mut pairs = first.values.iter().zip(&second.values);
-        // NaN is found.
+        // Written so that NaN is detected.
         let differs = |(a, b): (&f64, &f64)| !((a - b).abs() <= 1e-9 * most);
         if let Some(i) = pairs.position(differs) {
             return Err(CheckError::NotDeterministic {
@@ -97,7 +97,7 @@ pub(super) fn check_repeats(outputs: &[Array], again: &[Array]) -> Result<(), Ch
     Ok(())
 }
 
-/// Gradients are finite.
+/// Checks that gradients are finite.
 pub(super) fn check_gradients(
     inputs: &Inputs,
     gradients: &[Option<Vec<f64>>],

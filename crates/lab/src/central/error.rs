@@ -1,24 +1,24 @@
-//! What keeps a function from being checked.
+//! Errors of gradient checks.
 
 use std::path::PathBuf;
 
-/// What keeps a function from being checked. A wrong gradient is no error: it is a finding of the
+/// Why a function cannot be checked. A wrong gradient is not an error but a finding of the
 /// [`Report`](super::Report).
 #[derive(Debug, thiserror::Error)]
 pub enum CheckError {
     /// The function returned an error.
     #[error("the function failed: {0}")]
     Function(String),
-    /// The inputs cannot be checked as they are.
+    /// The inputs cannot be checked.
     #[error("inputs: {0}")]
     Inputs(String),
-    /// A setting does not fit.
+    /// A setting is invalid.
     #[error("settings: {0}")]
     Settings(String),
-    /// The outputs cannot be differentiated as they are.
+    /// The outputs cannot be differentiated.
     #[error("outputs: {0}")]
     Outputs(String),
-    /// An input holds NaN or an infinity.
+    /// An input contains NaN or infinity.
     #[error(
         "input `{input}` is {value} at {at:?}: gradients are checked at finite inputs, choose another"
     )]
@@ -30,19 +30,19 @@ pub enum CheckError {
         /// Its value.
         value: f64,
     },
-    /// An output holds NaN or an infinity.
+    /// An output contains NaN or infinity.
     #[error(
         "output {output} is {value} at {at:?}: choose inputs in the function's domain, or correct the function there"
     )]
     OutputNotFinite {
-        /// Place among the outputs, from 0.
+        /// Index of the output, from 0.
         output: usize,
         /// Index of the element.
         at: Vec<usize>,
         /// Its value.
         value: f64,
     },
-    /// An analytic gradient holds NaN or an infinity.
+    /// An analytic gradient contains NaN or infinity.
     #[error(
         "the gradient of input `{input}` is {value} at {at:?}: mask that point before the operation that cannot be differentiated there"
     )]
@@ -59,7 +59,7 @@ pub enum CheckError {
         "output {output} is {first} at {at:?}, and {second} when computed again with gradients: fix seeds, and keep no state"
     )]
     NotDeterministic {
-        /// Place among the outputs, from 0.
+        /// Index of the output, from 0.
         output: usize,
         /// Index of the element.
         at: Vec<usize>,
@@ -68,12 +68,12 @@ pub enum CheckError {
         /// Its value with gradients.
         second: f64,
     },
-    /// A fixture cannot be read, or does not fit the function.
+    /// A fixture cannot be read, or does not match the function.
     #[error("{}: {reason}", .file.display())]
     Fixture {
         /// The file.
         file: PathBuf,
-        /// What is wrong with it.
+        /// The reason.
         reason: String,
     },
 }

@@ -1,5 +1,5 @@
-//! A function of another framework: inputs, outputs, upstream gradients, and the gradients that
-//! they gave.
+//! Fixtures of a function in another framework: inputs, outputs, upstream gradients, and resulting
+//! gradients.
 
 use std::path::{Path, PathBuf};
 
@@ -13,11 +13,10 @@ use super::outputs::Outputs;
 use super::report::{Comparison, Coverage, Finding, Kind, Report, Row};
 use crate::gradcheck::{Array, check_unique_names, index_of};
 
-/// Relative difference of an element that passes, to the larger of itself and the root mean square
-/// of its tensor.
+/// Allowed difference, relative to the larger of an element and the root mean square of its tensor.
 const TOLERANCE: f64 = 1e-9;
 
-/// A file that `scripts/fixtures.py` wrote of a PyTorch function.
+/// A fixture of a PyTorch function, written by `scripts/fixtures.py`.
 ///
 /// | tensor | what it is |
 /// |---|---|
@@ -25,14 +24,14 @@ const TOLERANCE: f64 = 1e-9;
 /// | `grad.x` | the expected gradient of the input `x`; an input without one is a constant |
 /// | `grad_y` | the upstream gradient of the output `y` |
 ///
-/// All of them are F64 (F32 is read, too). The metadata entry `outputs` has the names of the
-/// outputs in order, with commas between.
+/// All tensors are F64 (F32 is read, too). The metadata entry `outputs` lists the names of the
+/// outputs in order, separated by commas.
 #[derive(Debug, Clone)]
 pub struct Fixture {
     file: PathBuf,
     tolerance: f64,
     inputs: Inputs,
-    /// Of the inputs, in order; `None` for constants.
+    /// Gradients of the inputs, in order; `None` for constants.
     gradients: Vec<Option<Array>>,
     outputs: Vec<Output>,
 }
@@ -44,17 +43,18 @@ struct Output {
     upstream: Array,
 }
 
-/// Compares a function with a file that `scripts/fixtures.py` wrote of its PyTorch twin: outputs
-/// and gradients, to 1e-9.
+/// Compares a function with a fixture of its PyTorch twin, written by `scripts/fixtures.py`:
+/// outputs and gradients, to 1e-9.
 ///
-/// The function gets the file's inputs by name and returns its outputs in the file's order.
+/// The function receives the fixture's inputs by name and returns its outputs in the fixture's
+/// order.
 ///
 /// # Errors
-/// When the file is no such fixture, the function fails, or its outputs have other shapes. A wrong
-/// value is no error: it is in the report.
+/// When the file is not a valid fixture, the function fails, or its outputs have other shapes. A
+/// wrong value is not an error; the report has it.
 ///
 /// # Panics
-/// When the function does, or asks for an input that the file does not have.
+/// When the function panics, or asks for an input that the fixture does not have.
 ///
 /// ```no_run
 /// use splat_lab::central::{NamedTensors, check_against_fixture};
@@ -81,7 +81,7 @@ impl Fixture {
     /// Reads a file.
     ///
     /// # Errors
-    /// When it cannot be read, is no safetensors file, or holds something that would not be
+    /// When the file cannot be read, is not safetensors, or contains something that would not be
     /// checked. The message names the file and the tensor.
     pub fn read(path: impl AsRef<Path>) -> Result<Self, CheckError> {
         let file = path.as_ref().to_path_buf();
@@ -149,32 +149,32 @@ impl Fixture {
         })
     }
 
-    /// Relative difference that passes, to the larger of an element and the root mean square of its
-    /// tensor; 1e-9 by default.
+    /// Sets the allowed difference, relative to the larger of an element and the root mean square
+    /// of its tensor. Default 1e-9.
     pub fn with_tolerance(mut self, tolerance: f64) -> Self {
         self.tolerance = tolerance;
         self
     }
 
-    /// The inputs, to give them to [`gradcheck`](super::gradcheck) as well.
+    /// The inputs, for use with [`gradcheck`](super::gradcheck) as well.
     pub fn inputs(&self) -> Inputs {
         self.inputs.clone()
     }
 
-    /// The upstream gradients of all outputs, for
+    /// Upstream gradients of all outputs, for
     /// [`Settings::with_upstream`](super::Settings::with_upstream).
     pub fn upstream(&self) -> Vec<f64> {
         let outputs = self.outputs.iter();
         outputs.flat_map(|o| o.upstream.values.clone()).collect()
     }
 
-    /// Compares a function's outputs and gradients with the file's.
+    /// Compares a function's outputs and gradients with the fixture's.
     ///
     /// # Errors
     /// When the function fails, or its outputs have other shapes or are not finite.
     ///
     /// # Panics
-    /// When the function does, or asks for an input that the file does not have.
+    /// When the function panics, or asks for an input that the fixture does not have.
     pub fn check<F, O>(&self, function: F) -> Result<Report, CheckError>
     where
         F: Fn(&NamedTensors) -> O,

@@ -1,4 +1,4 @@
-//! A closure, evaluated and differentiated.
+//! Evaluation and differentiation of a closure.
 
 use std::marker::PhantomData;
 
@@ -9,7 +9,7 @@ use super::inputs::{Arguments, Inputs, read, tensor};
 use super::outputs::{Outputs, Part};
 use crate::gradcheck::Array;
 
-/// Makes the weights of all outputs' elements from the outputs' shapes.
+/// Computes the weights of all outputs' elements from the outputs' shapes.
 pub(super) type Weights<'a> = dyn Fn(&[Vec<usize>]) -> Result<Vec<f64>, CheckError> + 'a;
 
 /// A function from arrays to arrays.
@@ -17,7 +17,7 @@ pub(super) trait Function {
     /// The outputs.
     fn outputs(&self, inputs: &Inputs) -> Result<Vec<Array>, CheckError>;
 
-    /// The outputs, and the gradients of their sum under `weights`: by input, `None` where autodiff
+    /// The outputs, and the gradients of their sum under `weights`, by input; `None` if autodiff
     /// has none.
     fn gradients(
         &self,
@@ -27,10 +27,10 @@ pub(super) trait Function {
     ) -> Result<Differentiated, CheckError>;
 }
 
-/// What [`Function::gradients`] returns.
+/// Result of [`Function::gradients`].
 pub(super) struct Differentiated {
     pub outputs: Vec<Array>,
-    /// Of all outputs' elements, one after the other.
+    /// Weights of all outputs' elements, concatenated.
     pub weights: Vec<f64>,
     pub gradients: Vec<Option<Vec<f64>>>,
 }

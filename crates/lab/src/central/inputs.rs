@@ -1,16 +1,16 @@
-//! Named inputs on the host, and the tensors made of them.
+//! Named inputs on the host, and conversion to tensors.
 
 use burn::tensor::{DType, Device, Gradients, Tensor, TensorData};
 
 use crate::gradcheck::Array;
 
-/// A tensor of the kind that checks compute with: double precision, on the CPU, known to autodiff.
+/// A tensor as used in checks: double precision, on the CPU, tracked by autodiff.
 ///
-/// For what a function needs beside its inputs. Tensors of another device or precision do not mix
-/// with them.
+/// For values that a function needs besides its inputs. Tensors of another device or precision do
+/// not mix with them.
 ///
 /// # Panics
-/// When there are not as many values as the shape has elements.
+/// When the number of values differs from the number of elements of the shape.
 ///
 /// ```
 /// let window = splat_lab::central::tensor([0.25, 0.5, 0.25], [3, 1]); // [3, 1]
@@ -21,8 +21,8 @@ pub fn tensor<const D: usize>(values: impl Into<Vec<f64>>, shape: [usize; D]) ->
     Tensor::from_data(TensorData::new(values.into(), shape), (&device, DType::F64))
 }
 
-/// Inputs whose number and ranks are known only when the program runs. Where they are known before,
-/// a tuple of pairs `("name", tensor)` is shorter: see [`Arguments`].
+/// Inputs whose number and ranks are known only at run time. If they are known at compile time, a
+/// tuple of pairs `("name", tensor)` is shorter: see [`Arguments`].
 ///
 /// ```
 /// use burn::tensor::Tensor;
@@ -43,13 +43,12 @@ pub struct Inputs {
 }
 
 impl Inputs {
-    /// No inputs yet.
+    /// An empty list of inputs.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// These and one more, of any float type and on any device. Its values are kept in double
-    /// precision.
+    /// Adds an input of any float type and device. Its values are kept in double precision.
     ///
     /// # Panics
     /// When the tensor cannot be read back.
@@ -76,15 +75,15 @@ impl Inputs {
 /// Inputs by name, as a function of [`Inputs`] receives them.
 #[derive(Debug, Clone)]
 pub struct NamedTensors {
-    /// Flat, with the shape that they have.
+    /// Flattened, with the original shapes.
     entries: Vec<(String, Vec<usize>, Tensor<1>)>,
 }
 
 impl NamedTensors {
-    /// The input of this name.
+    /// The input with this name.
     ///
     /// # Panics
-    /// When there is none, or it has another rank.
+    /// When there is no such input, or it has another rank.
     pub fn get<const D: usize>(&self, name: &str) -> Tensor<D> {
         let Some((_, shape, flat)) = self.entries.iter().find(|(n, ..)| n == name) else {
             let names: Vec<_> = self.entries.iter().map(|(name, ..)| name).collect();
@@ -97,7 +96,7 @@ impl NamedTensors {
     }
 }
 
-/// Named inputs of a function, and how it receives them.
+/// Named inputs of a function, and the form in which it receives them.
 ///
 /// | inputs | the function receives |
 /// |---|---|
@@ -106,21 +105,21 @@ impl NamedTensors {
 /// | `[("x", x), ("y", y)]`, all of one rank | `[x, y]` |
 /// | [`Inputs`] | [`NamedTensors`] |
 pub trait Arguments {
-    /// What the function receives: the same shapes, in double precision on the CPU.
+    /// The function's argument: the same shapes, in double precision on the CPU.
     type Tensors;
 
     /// The inputs on the host.
     fn into_inputs(self) -> Inputs;
 
-    /// The tensors of inputs with these names and ranks; with gradients where `tracked` says so.
+    /// The tensors of inputs with these names and ranks, tracked where `tracked` says so.
     #[doc(hidden)]
     fn tensors(inputs: &Inputs, tracked: &[bool]) -> Self::Tensors;
 
-    /// The gradients of those tensors; `None` where there is none.
+    /// Gradients of those tensors; `None` for untracked ones.
     #[doc(hidden)]
     fn gradients(tensors: &Self::Tensors, gradients: &Gradients) -> Vec<Option<Vec<f64>>>;
 
-    /// The same tensors once more.
+    /// A copy of the same tensors.
     #[doc(hidden)]
     fn share(tensors: &Self::Tensors) -> Self::Tensors;
 }

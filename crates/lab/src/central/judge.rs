@@ -1,30 +1,30 @@
-//! Whether a derivative along one line agrees, and if not, what is the matter.
+//! Judges whether derivatives along one line agree, and classifies failures.
 
 use super::Settings;
 use super::ladder::{Enough, Slope};
 use super::report::Kind;
 
-/// Relative difference of the slopes on both sides that makes a kink.
+/// Relative difference of the slopes on both sides that counts as a kink.
 const KINK: f64 = 1e-6;
-/// A derivative that is known less well than this part of itself is not known.
+/// Relative error above which a derivative counts as unknown.
 const UNKNOWN: f64 = 1e-2;
-/// Nor does it matter, where a change of the input by its own size changes the outputs by less than
-/// this part of theirs.
+/// An unknown derivative is negligible if a change of the input by its own size changes the outputs
+/// by less than this share.
 const NEGLIGIBLE: f64 = 1e-6;
 
-/// What is known of a line before it is followed. All per unit of the line.
+/// Known properties of a line before it is followed, per unit of the line.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Analytic {
-    /// The derivative along it; `None` where autodiff has none.
+    /// Derivative along the line; `None` if autodiff has none.
     pub value: Option<f64>,
-    /// Root of the sum of squares of its elements' derivatives.
+    /// Root of the sum of the squared derivatives of its elements.
     pub scale: f64,
     /// Root mean square derivative of the whole input.
     pub rms: f64,
 }
 
 impl Analytic {
-    /// Errors of a slope that decide nothing.
+    /// Slope errors that are small enough not to matter.
     pub(super) fn enough(&self, settings: &Settings) -> Enough {
         let scale = self.scale / settings.safety / 10.0;
         Enough {
@@ -33,12 +33,12 @@ impl Analytic {
         }
     }
 
-    /// The largest difference that passes.
+    /// Largest allowed difference.
     pub(super) fn allowed(&self, slope: &Slope, settings: &Settings) -> f64 {
         settings.safety * slope.central.error + settings.tolerance * (self.scale + 1e-3 * self.rms)
     }
 
-    /// `None` where all is well.
+    /// `None` if everything is fine.
     pub(super) fn judge(&self, slope: Option<&Slope>, settings: &Settings) -> Option<Kind> {
         let Some(slope) = slope else {
             return Some(Kind::OutsideDomain);

@@ -1,17 +1,16 @@
-//! The derivative along one line, from differences at smaller and smaller steps.
+//! Derivative along one line, from differences at decreasing steps.
 //!
-//! Each step is a quarter of the one before. Richardson's extrapolation takes the powers of the
-//! step out of the differences, and of all values in its tableau the one with the smallest
-//! estimated error is kept (Ridders 1982). Large steps are exact for smooth functions; small ones
-//! are what is left where a kink is near.
+//! Each step is a quarter of the previous one. Richardson's extrapolation removes the powers of the
+//! step from the differences, and the tableau value with the smallest estimated error is kept
+//! (Ridders 1982). Large steps are exact for smooth functions; near a kink only small ones remain.
 
 use super::noise::Noise;
 use super::sample::{Extent, LEVELS, RATIO, Sample};
 
-/// Rows of the tableau before it may be trusted.
+/// Rows of the tableau before it is trusted.
 const LEAST: usize = 3;
 
-/// A value and how far it may be off.
+/// A value with its error bound.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Estimate {
     pub value: f64,
@@ -22,28 +21,28 @@ pub(super) struct Estimate {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Slope {
     pub central: Estimate,
-    /// The slope on the right minus that on the left, at a step that goes to zero.
+    /// Slope on the right minus slope on the left, as the step goes to zero.
     pub jump: Estimate,
-    /// Size of the values that changed, at most.
+    /// Upper bound of the size of the values that changed.
     pub size: f64,
 }
 
-/// Errors below which smaller steps are not worth their time.
+/// Errors below which smaller steps are not worthwhile.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Enough {
     pub central: f64,
     pub jump: f64,
 }
 
-/// Goes down from the step `first` until the errors are `enough`, or as small as rounding allows.
-/// `None` where no two steps in a row can be used: `sample` says so by `None`.
+/// Decreases the step from `first` until the errors are `enough`, or as small as rounding allows.
+/// `None` if no two consecutive steps are usable, for which `sample` returns `None`.
 pub(super) fn climb_down<E>(
     first: f64,
     noise: Noise,
     enough: Enough,
     mut sample: impl FnMut(f64) -> Result<Option<Sample>, E>,
 ) -> Result<Option<Slope>, E> {
-    // Even powers of the step in the one, odd ones in the other.
+    // Even powers of the step for one, odd powers for the other.
     let mut central = Tableau::new(RATIO * RATIO);
     let mut jump = Tableau::new(RATIO);
     let mut extent = Extent::default();
@@ -77,14 +76,14 @@ pub(super) fn climb_down<E>(
     }))
 }
 
-/// The rows of Richardson's extrapolation, of which the last is kept.
+/// Rows of Richardson's extrapolation; only the last is kept.
 struct Tableau {
-    /// Factor by which the first power of the step that is taken out falls from row to row.
+    /// Factor by which the first eliminated power of the step falls from row to row.
     falls: f64,
     row: Vec<f64>,
     rows: usize,
     best: Estimate,
-    /// Rounding in `best`.
+    /// Rounding error of `best`.
     noise: f64,
 }
 
@@ -113,7 +112,7 @@ impl Tableau {
         for (column, before) in std::mem::take(&mut self.row).into_iter().enumerate() {
             let last = next[column];
             let value = last + (last - before) / (falls - 1.0);
-            // The first difference is that of two steps; a further one that of two extrapolations,
+            // The first difference is between two steps; later ones are between extrapolations,
             // too.
             let differs = match column {
                 0 => f64::INFINITY,

@@ -13,21 +13,21 @@ use super::sample::Sample;
 pub(super) struct Line<'a> {
     pub input: usize,
     pub range: Range<usize>,
-    /// Of every element of the input; those outside of `range` stay.
+    /// Move of every element of the input; elements outside `range` stay.
     pub moves: &'a [f64],
 }
 
-/// Evaluates a function along lines, under fixed weights of its outputs.
+/// Evaluates a function along lines, with fixed weights of its outputs.
 ///
-/// Outputs are subtracted element by element before they are summed. What does not change cancels
-/// exactly, and rounding is that of the elements, not that of their sum.
+/// Outputs are subtracted elementwise before they are summed. Unchanged values cancel exactly, and
+/// rounding is that of the elements, not that of their sum.
 pub(super) struct Probe<'a> {
     function: &'a dyn Function,
     inputs: Inputs,
-    /// Outputs at the inputs.
+    /// Outputs at the original inputs.
     middle: Vec<f64>,
     weights: Vec<f64>,
-    /// Inputs that are being moved.
+    /// Inputs being moved.
     moved: Inputs,
 }
 
@@ -47,7 +47,7 @@ impl<'a> Probe<'a> {
         }
     }
 
-    /// Differences at one step. `None` where an output is not finite.
+    /// Differences at one step. `None` if an output is not finite.
     pub(super) fn sample(&mut self, line: &Line, step: f64) -> Result<Option<Sample>, CheckError> {
         let right = self.at(line, step)?;
         let left = self.at(line, -step)?;
@@ -77,7 +77,7 @@ impl<'a> Probe<'a> {
         }))
     }
 
-    /// Outputs after the moves, `step` times.
+    /// Outputs after `step` times the moves.
     fn at(&mut self, line: &Line, step: f64) -> Result<Vec<f64>, CheckError> {
         let range = line.range.clone();
         let original = &self.inputs.entries[line.input].1.values[range.clone()];
@@ -106,9 +106,9 @@ impl<'a> Probe<'a> {
     }
 }
 
-/// The size of each element, as a power of two: steps of it are exact.
+/// Size of each element, as a power of two, so that steps are exact.
 ///
-/// That of an element near zero is a hundredth of the others' median.
+/// The size of an element near zero is a hundredth of the others' median.
 pub(super) fn sizes(values: &[f64]) -> Vec<f64> {
     let mut lengths: Vec<f64> = values
         .iter()

@@ -24,14 +24,15 @@
 //! # Ok::<(), splat_lab::central::CheckError>(())
 //! ```
 //!
-//! The outputs are summed under fixed random weights. One backward pass gives the analytic
-//! gradient. The numeric one comes from central differences at steps that shrink, extrapolated,
-//! with an estimate of their error (`ladder.rs`). An element passes if both agree to that error and
-//! a tolerance. Inputs of more than 1000 elements are moved along random directions, and a
-//! disagreement is followed to its element (`search.rs`). Where the slopes on the left and on the
-//! right differ, the point is named as a kink.
+//! The outputs are summed with fixed random weights. One backward pass gives the analytic gradient.
+//! The numeric one comes from central differences at decreasing steps, extrapolated, with an error
+//! estimate (`ladder.rs`). An element passes if both agree within that error and a tolerance.
+//! Inputs of more than 1000 elements are moved along random directions, and disagreements are
+//! traced to their elements (`search.rs`). Points where the slopes on the left and right differ are
+//! reported as kinks.
 //!
-//! [`Fixture`] compares with gradients from elsewhere, [`check_against_fixture`] in one call.
+//! [`Fixture`] compares with gradients from another framework; [`check_against_fixture`] does so in
+//! one call.
 
 mod checks;
 mod error;
@@ -66,17 +67,17 @@ use search::Search;
 /// Checks the gradient of a function at the given inputs, with default [`Settings`].
 ///
 /// - `function`: any closure of tensors that returns a tensor, a tuple of up to four, or a `Result`
-///   of either. It is evaluated in double precision on the CPU. What else it needs comes from
-///   [`tensor`].
+///   of either. It is evaluated in double precision on the CPU; create other tensors that it needs
+///   with [`tensor`].
 /// - `inputs`: named tensors of any ranks, float types and devices, see [`Arguments`].
 ///
 /// # Errors
 /// When the function returns an error, gives values or gradients that are not finite, gives
-/// different values when called again, or computes in another precision; or when an input is empty,
-/// not finite, or named twice. A wrong gradient is no error: it is in the report.
+/// different values when repeated, or computes in another precision; or when an input is empty, not
+/// finite, or named twice. A wrong gradient is not an error; the report has it.
 ///
 /// # Panics
-/// When the function does.
+/// When the function panics.
 ///
 /// ```
 /// use splat_lab::central::{gradcheck, tensor};
@@ -98,10 +99,10 @@ where
 /// [`gradcheck`] with settings.
 ///
 /// # Errors
-/// Those of [`gradcheck`], and when a setting does not fit.
+/// Those of [`gradcheck`], and when a setting is invalid.
 ///
 /// # Panics
-/// When the function does.
+/// When the function panics.
 ///
 /// ```
 /// use splat_lab::central::{Settings, gradcheck_with, tensor};
@@ -175,8 +176,7 @@ fn check(
     })
 }
 
-/// Weights of the outputs' elements: those of the settings, or random ones from 0.5 to 1 of either
-/// sign.
+/// Weights of the outputs' elements: from the settings, or random from 0.5 to 1 with random signs.
 fn weights(shapes: &[Vec<usize>], settings: &Settings) -> Result<Vec<f64>, CheckError> {
     let count = shapes
         .iter()

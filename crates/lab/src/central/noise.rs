@@ -1,32 +1,32 @@
-//! What rounding makes of differences.
+//! Rounding errors of differences.
 
 use super::sample::{Extent, LEVELS, RATIO, Sample};
 
-/// Rounding of two values, halved by the two steps between them.
+/// Rounding of two values, divided by the two steps between them.
 const ROUNDING: f64 = 0.5 * f64::EPSILON;
 
-/// What rounding makes of one output's element.
+/// Rounding error of one output element.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Noise {
-    /// As a multiple of what rounding the element itself makes.
+    /// Multiple of the rounding of the element itself.
     pub factor: f64,
-    /// Beside that, whatever the element's size.
+    /// Additional error, independent of the element's size.
     pub floor: f64,
 }
 
 impl Noise {
-    /// That of a function which is exact but for its last rounding.
+    /// Noise of a function that is exact except for its last rounding.
     pub(super) const LEAST: Self = Self {
         factor: 1.0,
         floor: 0.0,
     };
 
-    /// Of differences along one line, at a step of one.
+    /// Noise of differences along one line, at a step of one.
     pub(super) fn of(self, extent: Extent) -> f64 {
         ROUNDING * self.factor * extent.size + self.floor * extent.weight
     }
 
-    /// What explains that differences along a line are off by `found`, at a step of one.
+    /// Noise that explains an error of `found` in differences along a line, at a step of one.
     pub(super) fn that_explains(found: f64, at: Extent) -> Self {
         let factor = found / (ROUNDING * at.size);
         if factor <= 4.0 {
@@ -35,7 +35,7 @@ impl Noise {
                 floor: 0.0,
             };
         }
-        // Rounding inside of the function: in proportion to the outputs, or the same for all.
+        // Rounding inside the function: proportional to the outputs, or constant.
         Self {
             factor,
             floor: found / at.weight,
@@ -43,8 +43,8 @@ impl Noise {
     }
 }
 
-/// What rounding makes of differences at a step of one, from those at the smallest steps: `|change
-/// of the difference| * step`, at most.
+/// Rounding error of differences at a step of one, from the smallest steps: the largest `|change of
+/// the difference| * step`.
 pub(super) fn noise_at_the_bottom<E>(
     first: f64,
     mut sample: impl FnMut(f64) -> Result<Option<Sample>, E>,

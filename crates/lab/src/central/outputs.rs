@@ -1,10 +1,10 @@
-//! What a function may return.
+//! Return values of checked functions.
 
 use burn::tensor::Tensor;
 
-/// What a function may return: a tensor, a tuple of up to four, or a `Result` of either.
+/// Return value of a checked function: a tensor, a tuple of up to four, or a `Result` of either.
 pub trait Outputs {
-    /// The tensors in order, or why there are none.
+    /// The tensors in order, or the error.
     #[doc(hidden)]
     fn parts(self) -> Result<Vec<Part>, String>;
 }

@@ -1,4 +1,4 @@
-//! What a check found, as a table.
+//! Findings of a check, as a table.
 
 use std::fmt;
 
@@ -7,115 +7,114 @@ use std::fmt;
 /// `Display` prints a table with one row per input, and a line for each finding.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Report {
-    /// What the derivatives are compared with: `numeric` or `expected`.
+    /// Source of the compared derivatives: `numeric` or `expected`.
     pub compared_with: &'static str,
-    /// One per input, in order; for a fixture, one per output too.
+    /// One row per input, in order; for a fixture, one per output too.
     pub rows: Vec<Row>,
 }
 
-/// What was found in one tensor.
+/// Findings in one tensor.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Row {
-    /// Its name.
+    /// Name of the tensor.
     pub name: String,
-    /// Its shape.
+    /// Shape of the tensor.
     pub shape: Vec<usize>,
-    /// How it was looked at.
+    /// How the tensor was examined.
     pub coverage: Coverage,
-    /// The comparison that came closest to failing, or failed most; `None` where nothing was
-    /// compared.
+    /// The comparison that came closest to failing, or failed most; `None` if nothing was compared.
     pub worst: Option<Comparison>,
-    /// Whether every derivative is exactly zero, on both sides: the function does not depend on
-    /// this input at this point, so that not much was checked.
+    /// True if every derivative is exactly zero on both sides: the function does not depend on this
+    /// input at this point, so little was checked.
     pub all_zero: bool,
-    /// What is wrong, and kinks. No more than eight; then there may be more.
+    /// Failures and kinks. At most eight are listed; there may be more.
     pub findings: Vec<Finding>,
 }
 
-/// How a tensor was looked at.
+/// How a tensor was examined.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Coverage {
     /// Element by element.
     Elements(usize),
-    /// Along random directions over all of its elements.
+    /// Along random directions over all elements.
     Directions {
-        /// How many.
+        /// Number of directions.
         count: usize,
-        /// The smallest error of a single element's derivative that is surely seen, in units of the
-        /// root mean square derivative; both times the element's size.
+        /// Smallest error of a single element's derivative that is certain to be seen, in units of
+        /// the root mean square derivative; both times the element's size.
         limit: f64,
     },
-    /// Not at all: it is a constant.
+    /// Not examined: a constant.
     Constant,
 }
 
-/// An analytic derivative beside the one it is compared with.
+/// An analytic derivative and the value it is compared with.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Comparison {
-    /// Index of the element; `None` for a direction over all of them.
+    /// Index of the element; `None` for a direction over all elements.
     pub at: Option<Vec<usize>>,
-    /// What the function's own gradient says.
+    /// The function's own gradient.
     pub analytic: f64,
-    /// What it is compared with.
+    /// The reference value.
     pub numeric: f64,
-    /// How far `numeric` may be off.
+    /// Error bound of `numeric`.
     pub error: f64,
 }
 
-/// Something that was found at one element.
+/// A finding at one element.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Finding {
-    /// What it is.
+    /// Kind of finding.
     pub kind: Kind,
-    /// Where, and the numbers.
+    /// Position and numbers.
     pub comparison: Comparison,
 }
 
 /// Kinds of findings.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Kind {
-    /// The analytic derivative is not the numeric one.
+    /// The analytic derivative differs from the numeric one.
     Wrong,
-    /// Autodiff has no gradient, though the function depends on the input.
+    /// Autodiff has no gradient, although the function depends on the input.
     NoGradient,
     /// The derivatives on the left and on the right differ.
     Kink {
-        /// Towards smaller values.
+        /// Slope towards smaller values.
         left: f64,
-        /// Towards larger values.
+        /// Slope towards larger values.
         right: f64,
-        /// Whether it passes: the analytic derivative lies between both, and kinks are not refused.
+        /// True if it passes: the analytic derivative lies between both, and kinks are not refused.
         accepted: bool,
     },
-    /// The numeric derivative cannot be told: a discontinuity, noise, or a function that changes
-    /// faster than the steps.
+    /// The numeric derivative cannot be determined: a discontinuity, noise, or a function that
+    /// changes faster than the steps.
     Unresolved,
-    /// The function is not finite at any step beside this point.
+    /// The function is not finite at any step near this point.
     OutsideDomain,
 }
 
 impl Kind {
-    /// Whether it fails the check.
+    /// True if it fails the check.
     pub fn fails(self) -> bool {
         !matches!(self, Self::Kink { accepted: true, .. })
     }
 }
 
-/// The first thing that fails a check, in words.
+/// The first failure of a check, in words.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[error("{0}")]
 pub struct Failure(String);
 
 impl Report {
-    /// Whether no finding fails.
+    /// True if no finding fails.
     pub fn is_ok(&self) -> bool {
         self.failure().is_none()
     }
 
-    /// The report if it is ok.
+    /// Returns the report if it is ok.
     ///
     /// # Errors
-    /// Otherwise a message with input, element, numbers, and what to do.
+    /// Otherwise a message with input, element, numbers, and remedy.
     pub fn check(self) -> Result<Self, Failure> {
         match self.failure() {
             None => Ok(self),
@@ -123,7 +122,7 @@ impl Report {
         }
     }
 
-    /// Nothing if the report is ok. For tests.
+    /// Asserts that the report is ok. For tests.
     ///
     /// # Panics
     /// Otherwise, with the table.
@@ -137,8 +136,7 @@ impl Report {
         self.rows.iter().find(|row| row.name == name)
     }
 
-    /// The largest difference of any row's worst comparison, relative to the larger of both
-    /// derivatives.
+    /// The largest relative difference among the rows' worst comparisons.
     pub fn worst_relative(&self) -> f64 {
         let worst = self.rows.iter().filter_map(|row| row.worst.as_ref());
         worst.map(Comparison::relative).fold(0.0, f64::max)
@@ -196,12 +194,12 @@ impl Report {
 }
 
 impl Comparison {
-    /// Whether both derivatives are exactly zero.
+    /// True if both derivatives are exactly zero.
     pub(super) fn is_zero(&self) -> bool {
         self.analytic == 0.0 && self.numeric == 0.0
     }
 
-    /// The difference relative to the larger of both; 0 where they are equal.
+    /// Difference relative to the larger of both; 0 if they are equal.
     pub fn relative(&self) -> f64 {
         let difference = (self.analytic - self.numeric).abs();
         if difference == 0.0 {
@@ -220,7 +218,7 @@ impl Comparison {
 }
 
 impl Row {
-    /// That of an input which is not looked at.
+    /// Row of an input that is not examined.
     pub(super) fn constant(name: &str, shape: &[usize]) -> Self {
         Self {
             name: name.into(),
@@ -232,7 +230,7 @@ impl Row {
         }
     }
 
-    /// Whether no finding of it fails.
+    /// True if none of its findings fails.
     pub fn is_ok(&self) -> bool {
         !self.findings.iter().any(|finding| finding.kind.fails())
     }

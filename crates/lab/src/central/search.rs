@@ -1,10 +1,10 @@
-//! Looks for wrong elements: one by one in small inputs, by halving in large ones.
+//! Search for wrong elements: one by one in small inputs, by bisection in large ones.
 //!
-//! In a large input all elements are moved at once, by their size with random signs. The analytic
-//! derivative along such a direction costs nothing, as one backward pass gives the whole gradient;
-//! one wrong element changes it by its error, which the sum of all others does not hide, because
-//! differences are exact to many digits. Where they disagree, halves of the elements are moved, and
-//! so on down to one.
+//! In a large input all elements are moved at once, by their sizes with random signs. The analytic
+//! derivative along such a direction is free, as one backward pass gives the whole gradient. A
+//! single wrong element changes it by its error, which the sum of the others does not hide, as
+//! differences are exact to many digits. On disagreement, halves of the elements are moved,
+//! recursively down to one.
 
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
@@ -18,12 +18,12 @@ use super::sample::Extent;
 use super::{CheckError, Settings};
 use crate::gradcheck::index_of;
 
-/// Findings of a kind in one input; there may be more.
+/// Most findings of a kind in one input; there may be more.
 const MOST: usize = 8;
-/// The same in large inputs, where each takes as many evaluations as there are halvings.
+/// The same in large inputs, where each finding takes as many evaluations as there are halvings.
 const MOST_BY_HALVING: usize = 3;
 
-/// Tries to measure noise.
+/// Attempts to measure noise.
 const NOISE_TRIES: u64 = 5;
 
 /// The search in one input.
@@ -33,21 +33,21 @@ pub(super) struct Search<'a, 'p> {
     pub input: usize,
     pub shape: &'a [usize],
     pub values: &'a [f64],
-    /// The analytic gradient; `None` where autodiff has none.
+    /// The analytic gradient; `None` if autodiff has none.
     pub gradient: Option<&'a [f64]>,
 }
 
-/// What holds for all lines through the input.
+/// Known properties of all lines through the input.
 #[derive(Clone, Copy)]
 struct Known<'s> {
-    /// Sizes of its elements.
+    /// Sizes of the elements.
     sizes: &'s [f64],
     /// Root mean square of derivative times size.
     rms: f64,
     noise: Noise,
 }
 
-/// What a line gave.
+/// Result of following a line.
 struct Followed {
     analytic: Analytic,
     slope: Option<Slope>,
@@ -55,7 +55,7 @@ struct Followed {
 }
 
 impl Followed {
-    /// The difference as a multiple of what passes.
+    /// Difference as a multiple of the allowed one.
     fn severity(&self, settings: &Settings) -> f64 {
         let Some(slope) = &self.slope else {
             return f64::INFINITY;
@@ -94,7 +94,7 @@ impl Search<'_, '_> {
         Ok(row)
     }
 
-    /// Every element by itself.
+    /// Checks every element individually.
     fn each(&mut self, known: Known, row: &mut Row) -> Result<(), CheckError> {
         let mut most_severe = -1.0;
         let (mut failures, mut kinks) = (0, 0);
@@ -124,8 +124,8 @@ impl Search<'_, '_> {
         Ok(())
     }
 
-    /// Random directions, and the elements where they disagree. An element that was found does not
-    /// move any more.
+    /// Checks random directions, and the elements where they disagree. Elements already found are
+    /// not moved again.
     fn along_directions(&mut self, known: Known, row: &mut Row) -> Result<(), CheckError> {
         let n = known.sizes.len();
         let (mut most_severe, mut limit) = (-1.0, f64::INFINITY);
@@ -154,7 +154,7 @@ impl Search<'_, '_> {
                         moves[i] = 0.0;
                         finding
                     }
-                    // No element by itself explains it, or there are too many.
+                    // No single element explains it, or there are too many.
                     _ => Finding {
                         kind: refused(kind),
                         comparison: whole,
@@ -180,7 +180,7 @@ impl Search<'_, '_> {
         Ok(())
     }
 
-    /// The first element that is found by halving.
+    /// Finds the first wrong element by bisection.
     fn narrow(
         &mut self,
         moves: &[f64],
@@ -208,8 +208,8 @@ impl Search<'_, '_> {
         }))
     }
 
-    /// Moves of all elements by their size or half of it, with random signs. Two sizes, so that
-    /// equal errors of opposite sign rarely cancel.
+    /// Moves of all elements by their size or half of it, with random signs. Two sizes make it
+    /// unlikely that equal errors of opposite sign cancel.
     fn direction(&self, sizes: &[f64], number: u64) -> Vec<f64> {
         let seed = self.settings.seed ^ (number << 32) ^ ((self.input as u64) << 48);
         let mut rng = Pcg64Mcg::seed_from_u64(seed);
@@ -217,8 +217,8 @@ impl Search<'_, '_> {
         sizes.iter().map(move_).collect()
     }
 
-    /// How strongly rounding acts. The least of several tries, each with about half of the
-    /// elements, because one that crosses a kink or a jump takes that for noise.
+    /// Magnitude of rounding: the smallest of several attempts, each with about half of the
+    /// elements, since one that crosses a kink or jump takes that for noise.
     fn noise(&mut self, sizes: &[f64]) -> Result<Noise, CheckError> {
         let mut least: Option<Noise> = None;
         for number in 0..NOISE_TRIES {
@@ -296,8 +296,8 @@ impl Search<'_, '_> {
         }
     }
 
-    /// The error of one element that would have been seen, in units of the root mean square
-    /// derivative. Half a size is the least that an element moves.
+    /// Error of a single element that would have been seen, in units of the root mean square
+    /// derivative. Elements move by at least half their size.
     fn limit(&self, followed: &Followed) -> f64 {
         let (Some(slope), rms) = (&followed.slope, followed.analytic.rms) else {
             return f64::INFINITY;
@@ -320,7 +320,7 @@ impl Search<'_, '_> {
     }
 }
 
-/// The same kind, and no accepted kink: what else there is was not looked for.
+/// The same kind without accepted kinks, as others were not searched for.
 fn refused(kind: Kind) -> Kind {
     match kind {
         Kind::Kink { left, right, .. } => Kind::Kink {
@@ -332,7 +332,7 @@ fn refused(kind: Kind) -> Kind {
     }
 }
 
-/// Slopes per unit of the element rather than of its size.
+/// Slopes per unit of the element instead of its size.
 fn per_element(kind: Kind, size: f64) -> Kind {
     match kind {
         Kind::Kink {

@@ -1,4 +1,4 @@
-//! How closely gradients are checked.
+//! Settings of gradient checks.
 
 /// Settings of [`gradcheck_with`](super::gradcheck_with).
 ///
@@ -43,64 +43,65 @@ impl Settings {
         Self::default()
     }
 
-    /// Relative difference between analytic and numeric derivative that passes; 1e-7 by default.
+    /// Sets the allowed relative difference between analytic and numeric derivative. Default 1e-7.
     ///
-    /// Of an element it is relative to its own derivative, and a thousandth of that to the root
-    /// mean square of its input's. Along a direction over many elements it is relative to the root
-    /// of the sum of the squares of their derivatives.
+    /// For an element it is relative to its own derivative, and a thousandth of it to the root mean
+    /// square of its input's. For a direction over many elements it is relative to the root of the
+    /// sum of their squared derivatives.
     pub fn with_tolerance(mut self, tolerance: f64) -> Self {
         self.tolerance = tolerance;
         self
     }
 
-    /// Multiples of the numeric derivative's estimated error that pass as well; 10 by default.
+    /// Sets the multiple of the numeric derivative's estimated error that also passes. Default 10.
     pub fn with_safety(mut self, safety: f64) -> Self {
         self.safety = safety;
         self
     }
 
-    /// The largest step, relative to the size of an element; 1/64 by default. Smaller ones follow,
-    /// each a quarter of the one before, until the error is small. Choose it smaller for a function
-    /// that cannot be evaluated so far from its inputs.
+    /// Sets the largest step, relative to the size of an element. Default 1/64. Smaller steps
+    /// follow, each a quarter of the previous one, until the error is small. Choose a smaller value
+    /// for functions that cannot be evaluated so far from their inputs.
     pub fn with_step(mut self, step: f64) -> Self {
         self.step = step;
         self
     }
 
-    /// Inputs of at most this many elements are checked element by element, larger ones along
-    /// directions; 1000 by default.
+    /// Sets the number of elements up to which inputs are checked element by element; larger ones
+    /// are checked along directions. Default 1000.
     pub fn with_each_up_to(mut self, elements: usize) -> Self {
         self.each_up_to = elements;
         self
     }
 
-    /// Random directions over all elements of a large input; 4 by default. One finds nearly every
-    /// wrong element; more of them make it less likely that errors of two elements cancel.
+    /// Sets the number of random directions over all elements of a large input. Default 4. One
+    /// finds nearly every wrong element; more make it less likely that errors of two elements
+    /// cancel.
     pub fn with_directions(mut self, directions: usize) -> Self {
         self.directions = directions;
         self
     }
 
-    /// Seed of the directions and of the weights of the outputs; 0 by default.
+    /// Sets the seed of the directions and of the outputs' weights. Default 0.
     pub fn with_seed(mut self, seed: u64) -> Self {
         self.seed = seed;
         self
     }
 
-    /// Every kink fails, even where the gradient lies between the slopes on both sides.
+    /// Makes every kink fail, even if the gradient lies between the slopes on both sides.
     pub fn with_kinks_refused(mut self) -> Self {
         self.refuse_kinks = true;
         self
     }
 
-    /// Weights of the outputs' elements in the sum that is differentiated: outputs in order, each
-    /// row-major. Random ones, of both signs and none near zero, by default.
+    /// Sets the weights of the outputs' elements in the sum that is differentiated: outputs in
+    /// order, each row-major. Random by default, of both signs and none near zero.
     pub fn with_upstream(mut self, upstream: impl Into<Vec<f64>>) -> Self {
         self.upstream = Some(upstream.into());
         self
     }
 
-    /// The input of this name is handed to the function and not differentiated.
+    /// Passes the input of this name to the function without differentiating it.
     pub fn with_constant(mut self, input: impl Into<String>) -> Self {
         self.constants.push(input.into());
         self

@@ -1,5 +1,5 @@
-//! Reads a gradient fixture: one safetensors file with a scene, upstream gradients and what a
-//! reference implementation made of them.
+//! Reads a gradient fixture: a safetensors file with a scene, upstream gradients, and the results
+//! of a reference implementation.
 
 mod metadata;
 pub(crate) mod unique;
@@ -14,7 +14,7 @@ use self::metadata::Metadata;
 use super::GradcheckError;
 use super::scene::{Array, Inputs, Outputs, Scene, index_of};
 
-/// Inputs; each has a gradient beside it, `grad.` and its name.
+/// Inputs. The gradient of each is named `grad.` and its name.
 const INPUTS: [&str; 8] = [
     "means",
     "quats",
@@ -26,35 +26,35 @@ const INPUTS: [&str; 8] = [
     "background",
 ];
 
-/// Pictures; each has an upstream gradient beside it, `grad_` and its name.
+/// Images. The upstream gradient of each is named `grad_` and its name.
 const PICTURES: [&str; 3] = ["image", "alpha", "depth"];
 
-/// One fixture, validated.
+/// A validated fixture.
 #[derive(Debug, Clone)]
 pub struct Fixture {
-    /// What it covers, in words.
+    /// Description of the case.
     pub case: String,
-    /// Marked by its author as numerically hard: judged more mildly in single precision.
+    /// Marked by its author as numerically hard, for a milder gate in single precision.
     pub hard: bool,
-    /// What is rendered and differentiated; `upstream.depth` is zero where the file has a depth
+    /// The scene to render and differentiate; `upstream.depth` is zero if the file has a depth
     /// without a gradient.
     pub scene: Scene,
-    /// What the reference rendered.
+    /// Images of the reference.
     pub expected: Outputs,
-    /// What the reference's autograd returned.
+    /// Gradients of the reference's autograd.
     pub gradients: Inputs,
 }
 
 impl Fixture {
     /// Reads and validates a file.
     ///
-    /// Missing metadata take the defaults of the ops; `width` and `height` those of the image,
-    /// `sh_degree` the highest.
+    /// Missing metadata default to the ops' defaults; `width` and `height` to those of the image,
+    /// `sh_degree` to the highest.
     ///
     /// # Errors
     /// When the file cannot be read, a tensor is missing, has a wrong type or shape or a value that
-    /// is not finite, or a metadata entry does not parse; also where the file holds something that
-    /// would not be checked. The message names file and tensor.
+    /// is not finite, a metadata entry does not parse, or the file contains something that would
+    /// not be checked. The message names the file and the tensor.
     pub fn read(path: &Path) -> Result<Self, GradcheckError> {
         let bytes = std::fs::read(path).map_err(|source| GradcheckError::Read {
             file: path.to_path_buf(),
@@ -63,7 +63,7 @@ impl Fixture {
         Self::parse(path, &bytes)
     }
 
-    /// [`read`](Self::read) on the content of a file; `path` is for messages.
+    /// [`read`](Self::read) from the contents of a file; `path` is used in messages.
     ///
     /// # Errors
     /// Those of [`read`](Self::read).
@@ -100,7 +100,7 @@ impl Reader<'_> {
         self.metadata.check_camera_model()?;
         self.metadata.check_keys()?;
         self.check_names()?;
-        // N and C come from the first tensors that hold them; every other shape must agree.
+        // N and C come from the first tensors that have them; all other shapes must agree.
         let means = self.any("means")?;
         let n = match means.shape.as_slice() {
             [n, 3] => *n,
@@ -130,7 +130,7 @@ impl Reader<'_> {
             height: self.metadata.side("height", height)?,
         };
 
-        // More rows than the degree uses are not read; their gradient must be zero.
+        // Rows beyond the degree are not read; their gradient must be zero.
         let sh_degree = self.metadata.degree()?;
         let rows = match self.any("sh_coeffs")?.shape.as_slice() {
             [_, rows, _] if *rows >= sh_coefficient_count(sh_degree) => *rows,
@@ -196,7 +196,8 @@ impl Reader<'_> {
         })
     }
 
-    /// Refuses what is no Gaussian and no camera: reference and ours would not mean the same by it.
+    /// Refuses invalid Gaussians and cameras, which the reference and our ops might interpret
+    /// differently.
     fn check_ranges(&self, inputs: &Inputs) -> Result<(), GradcheckError> {
         let opacities = (&inputs.opacities, 0.0..=1.0);
         let scales = (&inputs.scales, 0.0..=f64::INFINITY);
@@ -242,7 +243,7 @@ impl Reader<'_> {
         Ok(())
     }
 
-    /// A tensor of any shape, all of its values finite.
+    /// A tensor of any shape with finite values.
     fn any(&self, name: &str) -> Result<Array, GradcheckError> {
         let view = self
             .tensors

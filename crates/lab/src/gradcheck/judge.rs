@@ -1,9 +1,10 @@
-//! Compares gradients with a reference, per parameter group, and decides.
+//! Compares gradients with a reference, by parameter group, and judges them.
 //!
-//! One number hides too much: a gradient can have the right length and a wrong sign in one field,
-//! or be zero altogether. So each group gets its relative L2 error, 1 - cosine, signed bias, worst
-//! element and share of zeros; the gate is on the relative L2 error, which bounds the cosine
-//! (1 - cos <= rel^2 / 2 to first order) and catches a vanished gradient (rel = 1).
+//! A single number hides too much: a gradient can have the right length and a wrong sign in one
+//! field, or be zero altogether. Each group therefore gets its relative L2 error, 1 - cosine,
+//! signed bias, worst element and share of zeros. The gate is on the relative L2 error, which
+//! bounds the cosine (1 - cos <= rel^2 / 2 to first order) and catches a vanished gradient (rel =
+//! 1).
 
 use std::path::PathBuf;
 
@@ -12,11 +13,11 @@ use super::fixture::Fixture;
 use super::run::Computed;
 use super::scene::{Array, Inputs, index_of};
 
-/// Gate of double precision, on the relative L2 error.
+/// Gate on the relative L2 error in double precision.
 const GATE_F64: f64 = 1e-9;
-/// Gate of single precision for ordinary scenes.
+/// Gate in single precision for ordinary scenes.
 const GATE_F32: f64 = 1e-5;
-/// Gate of single precision for scenes marked hard: needles, pancakes, extreme scales and offsets.
+/// Gate in single precision for scenes marked hard: needles, pancakes, extreme scales and offsets.
 const GATE_F32_HARD: f64 = 1e-3;
 
 /// Largest relative L2 error that passes.
@@ -28,19 +29,19 @@ pub fn gate(precision: Precision, hard: bool) -> f64 {
     }
 }
 
-/// How one group of gradients compares with its reference.
+/// Comparison of one group of gradients with its reference.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GroupReport {
     /// Name of the group: a tensor of the fixture, or a part of one.
     pub name: &'static str,
-    /// |g - r| / |r|. Where the reference is all zero (`reference_is_zero`): what g would change
-    /// the loss by, beside the group with the largest effect (see [`compare`]).
+    /// Relative L2 error, |g - r| / |r|. If the reference is all zero (`reference_is_zero`), the
+    /// effect of g on the loss, relative to the group with the largest effect (see [`compare`]).
     pub rel_l2: f64,
-    /// 1 - cos(g, r); 0 where the reference is all zero.
+    /// 1 - cos(g, r); 0 if the reference is all zero.
     pub one_minus_cosine: f64,
-    /// sum(g - r) / sum |r|; 0 where the reference is all zero.
+    /// sum(g - r) / sum |r|; 0 if the reference is all zero.
     pub bias: f64,
-    /// Largest |g - r| / (|r| + 1e-6 rms(r)); the largest |g| where the reference is all zero.
+    /// Largest |g - r| / (|r| + 1e-6 rms(r)); the largest |g| if the reference is all zero.
     pub worst: f64,
     /// Index of that element in the fixture's tensor; empty for an empty group.
     pub worst_index: Vec<usize>,
@@ -48,56 +49,57 @@ pub struct GroupReport {
     pub zeros: f64,
     /// Share of exact zeros in the reference.
     pub zeros_reference: f64,
-    /// Whether every element of the reference is zero.
+    /// True if every element of the reference is zero.
     pub reference_is_zero: bool,
-    /// Whether the relative L2 error is within the gate.
+    /// True if the relative L2 error is within the gate.
     pub pass: bool,
 }
 
-/// How one rendered picture compares with its reference.
+/// Comparison of one image with its reference.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OutputReport {
-    /// image, alpha or depth.
+    /// `image`, `alpha` or `depth`.
     pub name: &'static str,
     /// Largest absolute difference.
     pub max_abs: f64,
     /// |ours - reference| / |reference|; |ours| where the reference is all zero.
     pub rel_l2: f64,
-    /// Whether the relative L2 error is within the gate.
+    /// True if the relative L2 error is within the gate.
     pub pass: bool,
 }
 
-/// Everything about one fixture on one device in one precision.
+/// Result for one fixture on one device in one precision.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FileReport {
     /// The fixture.
     pub file: PathBuf,
-    /// What it covers.
+    /// Description of the case.
     pub case: String,
     /// Precision of the check.
     pub precision: Precision,
-    /// Whether the fixture is marked hard.
+    /// True if the fixture is marked hard.
     pub hard: bool,
     /// Largest relative L2 error that passes.
     pub gate: f64,
-    /// means, quats, scales, opacities, sh0, sh_rest, viewmat, intrinsics, background.
+    /// Groups: means, quats, scales, opacities, sh0, sh_rest, viewmat, intrinsics, background.
     pub groups: Vec<GroupReport>,
-    /// image, alpha and, where the fixture has it, depth.
+    /// Images: image, alpha and, if the fixture has it, depth.
     pub outputs: Vec<OutputReport>,
-    /// Pixels near a threshold. In single precision those that its rounding of an alpha or a
-    /// transmittance may decide differently: they are left out, of the pictures and of the loss. In
-    /// double precision those within 1e-6, relatively: they count like any other.
+    /// Pixels near a threshold. In single precision those are the pixels that rounding of an alpha
+    /// or a transmittance may decide differently; they are excluded from the images and from the
+    /// loss. In double precision they are the pixels within a relative 1e-6, and count like any
+    /// other.
     pub near_threshold: usize,
-    /// Pixels in all.
+    /// Total number of pixels.
     pub pixels: usize,
-    /// Why it does not pass, beside the gates.
+    /// Reasons for failing, besides the gates.
     pub reasons: Vec<String>,
-    /// Whether every gate holds, and there is no other reason.
+    /// True if every gate holds and there is no other reason to fail.
     pub pass: bool,
 }
 
 impl FileReport {
-    /// Names of the groups and pictures beyond the gate.
+    /// Names of the groups and images beyond the gate.
     pub fn failed(&self) -> Vec<&'static str> {
         let groups = self.groups.iter().filter(|g| !g.pass).map(|g| g.name);
         let outputs = self.outputs.iter().filter(|o| !o.pass).map(|o| o.name);
@@ -114,11 +116,11 @@ impl FileReport {
     }
 }
 
-/// Judges computed pictures and gradients by the fixture's.
+/// Judges computed images and gradients by the fixture's.
 ///
-/// A group whose reference is all zero (a rotation of spheres, unused bands of spherical
-/// harmonics) has no scale of its own. It is judged by what it would change the loss by, were the
-/// parameters moved by their own size: |g| rms(x) over the largest |r| rms(x) of all groups.
+/// A group whose reference is all zero (a rotation of spheres, unused bands of spherical harmonics)
+/// has no scale of its own. It is judged by its effect on the loss if the parameters moved by their
+/// own size: |g| rms(x) over the largest |r| rms(x) of all groups.
 pub fn compare(
     fixture: &Fixture,
     computed: &Computed,
@@ -169,7 +171,7 @@ pub fn compare(
 struct Group {
     name: &'static str,
     array: Array,
-    /// Added to the index of each dimension to get that in the fixture's tensor.
+    /// Offset of each dimension's index within the fixture's tensor.
     offset: Vec<usize>,
 }
 
@@ -280,8 +282,9 @@ fn judge_output(name: &'static str, ours: &Array, reference: &Array, gate: f64) 
     }
 }
 
-/// 1 - cos as half the squared distance of the unit vectors: exact to the last digits where
-/// 1 - dot / (|g| |r|) would be rounding noise. A zero vector is at right angles to everything.
+/// 1 - cos as half the squared distance of the unit vectors, which is exact to the last digits
+/// where 1 - dot / (|g| |r|) would be rounding noise. A zero vector is at right angles to
+/// everything.
 fn one_minus_cosine(g: &[f64], r: &[f64]) -> f64 {
     let (lg, lr) = (norm(g), norm(r));
     if lg == 0.0 || lr == 0.0 {
@@ -311,7 +314,7 @@ fn norm(values: &[f64]) -> f64 {
     values.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-/// Root mean square of an input; 1 for one that is zero (a black background still has a scale).
+/// Root mean square of an input; 1 if it is zero (a black background still has a scale).
 fn size(input: &Array) -> f64 {
     match input.rms() {
         0.0 => 1.0,
@@ -383,7 +386,7 @@ mod tests {
     #[test]
     fn a_zero_reference_is_judged_by_its_effect_on_the_loss() {
         assert!(judged(&[0.0; 4], &[0.0; 4]).pass);
-        // 1e-3 beside a largest effect of 100 is 1e-5 of it; 1 is 1e-2 of it.
+        // 1e-3 relative to a largest effect of 100 is 1e-5; 1 is 1e-2.
         assert!(judged(&[1e-3, 0.0, 0.0, 0.0], &[0.0; 4]).pass);
         assert!(!judged(&[1.0, 0.0, 0.0, 0.0], &[0.0; 4]).pass);
     }

@@ -1,17 +1,17 @@
-//! A check in single precision: the pixels that it may decide differently are left out.
+//! Checks in single precision, with the pixels excluded that it may decide differently.
 //!
-//! Where alpha or transmittance lies within single precision's rounding of a threshold, a splat may
-//! be blended in one precision and not in the other, and neither is wrong. The upstream gradient of
-//! these pixels counts in neither side: ours in double precision, which must itself match the file
-//! with every pixel counted, then stands for the reference without them. The file's pictures are
-//! compared without them too. More than a hundredth of all pixels may not be.
+//! If alpha or transmittance lies within rounding of a threshold, a splat may be blended in one
+//! precision and not in the other, and neither is wrong. The upstream gradient of these pixels is
+//! zeroed on both sides: our double-precision result, which must itself match the file with every
+//! pixel counted, then serves as the reference without them. The file's images are compared without
+//! them too. At most one pixel in a hundred may be excluded.
 
 use burn::tensor::Device;
 
 use super::thresholds::near_in_single;
 use super::{Bug, FileReport, Fixture, GradcheckError, Outputs, Precision, compare, run};
 
-/// At most one pixel in so many may be left out.
+/// At most one pixel in this many may be excluded.
 const RARE: usize = 100;
 
 /// Checks a fixture in single precision on a device.

@@ -1,13 +1,13 @@
-//! Gradient checks: a scene with known gradients (a fixture) against our ops on any device.
+//! Gradient checks of the ops on any device against a scene with known gradients (a fixture).
 //!
 //! ```text
 //! *.safetensors ──fixture──> scene, expected ──run──> rendered, gradients ──judge──> FileReport ──report──> table, JSON
 //! ```
 //!
-//! In single precision, pixels on a threshold of blending are left out (`left_out.rs`).
+//! In single precision, pixels on a blending threshold are excluded (`left_out.rs`).
 //!
 //! The fixtures come from PyTorch in float64 (`tests/fixtures/generate.py`); any framework can
-//! write one. [`check_file`] does it all for one file.
+//! write one. [`check_file`] checks one file.
 
 mod fixture;
 mod judge;
@@ -39,7 +39,7 @@ pub(crate) use scene::index_of;
 pub use scene::{Array, Inputs, Outputs, Scene};
 pub use thresholds::{NEAR, Walk, near_in_single, walk};
 
-/// Floating point type that a check runs in.
+/// Floating point type of a check.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Precision {
     /// Single precision, on every device.
@@ -49,7 +49,7 @@ pub enum Precision {
 }
 
 impl Precision {
-    /// Burn's name for it.
+    /// The corresponding Burn type.
     pub fn dtype(self) -> DType {
         match self {
             Self::F32 => DType::F32,
@@ -67,7 +67,7 @@ impl std::fmt::Display for Precision {
     }
 }
 
-/// What keeps a fixture from being checked. Every message names the file.
+/// Why a fixture cannot be checked. Every message names the file.
 #[derive(Debug, thiserror::Error)]
 pub enum GradcheckError {
     /// The file cannot be read.
@@ -75,7 +75,7 @@ pub enum GradcheckError {
     Read {
         /// The fixture.
         file: PathBuf,
-        /// Why.
+        /// The system's error.
         source: std::io::Error,
     },
     /// The file is not safetensors.
@@ -83,27 +83,27 @@ pub enum GradcheckError {
     Format {
         /// The fixture.
         file: PathBuf,
-        /// Why.
+        /// The reason.
         reason: String,
     },
-    /// A tensor is missing or does not fit.
+    /// A tensor is missing or invalid.
     #[error("{}: tensor `{tensor}`: {reason}", .file.display())]
     Tensor {
         /// The fixture.
         file: PathBuf,
-        /// Its name in the file.
+        /// Name of the tensor.
         tensor: String,
-        /// What is wrong with it.
+        /// The reason.
         reason: String,
     },
-    /// A metadata entry does not fit.
+    /// A metadata entry is invalid.
     #[error("{}: metadata `{key}`: {reason}", .file.display())]
     Metadata {
         /// The fixture.
         file: PathBuf,
         /// The entry.
         key: String,
-        /// What is wrong with it.
+        /// The reason.
         reason: String,
     },
     /// The ops refuse the scene.
@@ -111,7 +111,7 @@ pub enum GradcheckError {
     Op {
         /// The fixture.
         file: PathBuf,
-        /// Why.
+        /// The op's error.
         source: OpError,
     },
     /// The device cannot run the check.
@@ -119,17 +119,17 @@ pub enum GradcheckError {
     Device {
         /// The fixture.
         file: PathBuf,
-        /// Why.
+        /// The reason.
         reason: String,
     },
 }
 
-/// Reads a fixture, renders it on a device, takes the gradients and judges them; with a known
-/// [`Bug`] switched on as a negative control.
+/// Reads a fixture, renders it on a device, takes the gradients and judges them. A known [`Bug`]
+/// can be switched on as a negative control.
 ///
 /// # Errors
-/// When the file is not a valid fixture, or the device or the ops refuse it. A wrong gradient is no
-/// error: it is a report with `pass` false.
+/// When the file is not a valid fixture, or the device or the ops refuse it. A wrong gradient is
+/// not an error; it is a report with `pass` false.
 pub fn check_file(
     path: &Path,
     device: &Device,
@@ -139,11 +139,11 @@ pub fn check_file(
     check(&Fixture::read(path)?, device, precision, bug)
 }
 
-/// [`check_file`] on a fixture in memory.
+/// [`check_file`] for a fixture in memory.
 ///
-/// In single precision the pixels that rounding may decide differently are left out, see
-/// [`FileReport::near_threshold`]. That takes double precision on the CPU: built without the
-/// feature `cpu`, every pixel counts.
+/// In single precision, pixels that rounding may decide differently are excluded, see
+/// [`FileReport::near_threshold`]. That needs double precision on the CPU; without the feature
+/// `cpu`, every pixel counts.
 ///
 /// # Errors
 /// When the device or the ops refuse the scene.

@@ -7,7 +7,7 @@ use serde_json::{Map, Value, json};
 use super::Precision;
 use super::judge::FileReport;
 
-/// A table: one row per file and parameter group, then the pictures.
+/// A table with one row per file and parameter group, followed by the images.
 pub fn table(reports: &[FileReport]) -> String {
     let mut text = String::new();
     for report in reports {
@@ -83,8 +83,8 @@ fn verdict(pass: bool) -> &'static str {
     if pass { "pass" } else { "FAIL" }
 }
 
-/// `{"files": [{"file", "case", "groups": {...}, "image": {...}, ..., "pass"}]}`. A number that is
-/// not finite is null.
+/// `{"files": [{"file", "case", "groups": {...}, "image": {...}, ..., "pass"}]}`. Numbers that are
+/// not finite are null.
 pub fn json(reports: &[FileReport]) -> Value {
     json!({ "files": reports.iter().map(file_json).collect::<Vec<_>>() })
 }

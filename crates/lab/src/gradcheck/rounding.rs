@@ -1,9 +1,9 @@
-//! How far alpha and transmittance may lie from their exact values in single precision.
+//! Rounding errors of alpha and transmittance in single precision.
 //!
 //! To first order, with u = 2^-24 the largest relative error of one rounding and k u that of a
-//! chain of k of them: four in a sum of four products; a quotient (2.5 units in the last place on a
-//! GPU), a product and a sum; in the inverse Cholesky factor, from quaternion and scales, more than
-//! ten, and so many at most in the exponential.
+//! chain of k roundings: four in a sum of four products; a quotient (2.5 units in the last place on
+//! a GPU), a product and a sum; more than ten in the inverse Cholesky factor, from quaternion and
+//! scales, and at most as many in the exponential.
 //!
 //! ```text
 //! p = W mu + t          dp = 4 u (|W| |mu| + |t|), nothing where every product and sum is a single-precision number
@@ -15,21 +15,21 @@
 //! T' = T (1 - alpha)    dT' = (1 - alpha) dT + T dalpha + 2 u T
 //! ```
 //!
-//! so transmittance loses 2 u and what the alphas lose with every splat in front. What comes out
-//! exact in any order of operations has no error: a mean on a pixel's centre has an alpha of
-//! exactly its opacity, and 1/2 of 1/2 is 1/4.
+//! Transmittance therefore loses 2 u and the errors of the alphas with every splat in front. Values
+//! that are exact in any order of operations have no error: a mean on a pixel's centre has an alpha
+//! of exactly its opacity, and 1/2 of 1/2 is 1/4.
 
 /// Largest relative error of rounding to single precision.
 const UNIT: f64 = f32::EPSILON as f64 / 2.0;
 
-/// Roundings of the sum of four products that a camera-space coordinate is.
+/// Roundings in a camera-space coordinate, a sum of four products.
 const SUM: f64 = 4.0;
 /// Roundings from there to a screen mean.
 const QUOTIENT: f64 = 8.0;
-/// Roundings of the inverse Cholesky factor, its products, the exponential.
+/// Roundings of the inverse Cholesky factor, its products, and the exponential.
 const CHAIN: f64 = 16.0;
 
-/// Error of a screen mean in pixels, given the Gaussian's mean, a row-major view matrix and fx, fy,
+/// Error of a screen mean in pixels, from the Gaussian's mean, a row-major view matrix and fx, fy,
 /// cx, cy.
 pub(super) fn screen_mean(mean: &[f64], viewmat: &[f64], intrinsics: &[f64]) -> [f64; 2] {
     let [(x, dx), (y, dy), (z, dz)] = [0, 4, 8].map(|row| {
@@ -46,7 +46,7 @@ pub(super) fn screen_mean(mean: &[f64], viewmat: &[f64], intrinsics: &[f64]) -> 
     ]
 }
 
-/// A sum in order, and its error.
+/// A sum in order, with its error.
 fn sum(terms: [f64; 4]) -> (f64, f64) {
     let (mut total, mut exact) = (0.0, true);
     for term in terms {
@@ -57,9 +57,9 @@ fn sum(terms: [f64; 4]) -> (f64, f64) {
     (total, if exact { 0.0 } else { SUM * UNIT * size })
 }
 
-/// Error of `alpha`, which is the opacity times `e^-sigma`, at (`dx`, `dy`) from the screen mean;
-/// `mean` is that of the screen mean, `factor` the inverse Cholesky factor. `compensated` where the
-/// opacity itself was computed.
+/// Error of `alpha`, which is the opacity times `e^-sigma`, at (`dx`, `dy`) from the screen mean.
+/// `mean` is the error of the screen mean, `factor` the inverse Cholesky factor, and `compensated`
+/// true if the opacity itself was computed.
 pub(super) fn alpha(
     alpha: f64,
     [dx, dy]: [f64; 2],
@@ -84,7 +84,7 @@ pub(super) fn alpha(
     alpha * error
 }
 
-/// Transmittance behind a splat of this `alpha`, and its error, from those before it and the error
+/// Transmittance behind a splat of this `alpha`, with its error, from those before it and the error
 /// of `alpha`.
 pub(super) fn behind((before, error): (f64, f64), alpha: f64, alpha_error: f64) -> (f64, f64) {
     let left = before * (1.0 - alpha);

@@ -1,4 +1,4 @@
-//! Renders a scene with our ops and takes the gradients of its loss with Burn's autodiff.
+//! Renders a scene with the ops and takes the gradients of its loss with Burn's autodiff.
 
 use burn::tensor::{DType, Device, Gradients, Tensor, TensorData};
 use splat_ops::{OpError, Projected, Rendered, project, rasterize, spherical_harmonics};
@@ -6,15 +6,15 @@ use splat_ops::{OpError, Projected, Rendered, project, rasterize, spherical_harm
 use super::scene::{Array, Inputs, Outputs, Scene};
 use super::{GradcheckError, Precision};
 
-/// A known bug for negative controls. A suite that passes with one of them proves nothing.
+/// A known bug, for negative controls: a suite that passes with one of them proves nothing.
 ///
-/// Each is made by composing the ops wrongly; the ops themselves know nothing of it.
+/// Each is made by composing the ops wrongly; the ops themselves are unaware of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Bug {
-    /// The direction of the spherical harmonics passes no gradient to the means and the camera.
+    /// The direction of the spherical harmonics passes no gradient to means and camera.
     DirectionDetached,
-    /// The backward of the projection takes the quaternion for one of length 1 that needs no
-    /// normalisation: no division by its length, and a part along the quaternion is left in.
+    /// The backward pass of the projection treats the quaternion as normalised: it does not divide
+    /// by its length, and leaves a component along the quaternion.
     QuaternionNormalisationSkipped,
     /// Half of the gradient through the off-diagonal entry of the inverse covariance is lost.
     OffDiagonalHalved,
@@ -23,7 +23,7 @@ pub enum Bug {
 }
 
 impl Bug {
-    /// All of them.
+    /// All bugs.
     pub const ALL: [Self; 4] = [
         Self::DirectionDetached,
         Self::QuaternionNormalisationSkipped,
@@ -32,16 +32,16 @@ impl Bug {
     ];
 }
 
-/// What our ops make of a scene.
+/// Results of the ops for a scene.
 #[derive(Debug, Clone)]
 pub struct Computed {
-    /// Pictures, in the shapes of the scene's upstream gradients.
+    /// Images, in the shapes of the scene's upstream gradients.
     pub outputs: Outputs,
     /// Gradients of the scene's loss, in the shapes of its inputs.
     pub gradients: Inputs,
-    /// Screen splats `[C, N, 9]`, as [`Projected::packed`] holds them.
+    /// Screen splats `[C, N, 9]`, in the layout of [`Projected::packed`].
     pub projected: Array,
-    /// Opacities at the rasteriser `[C, N]`: compensated in anti-aliased mode.
+    /// Opacities passed to the rasteriser `[C, N]`: compensated in anti-aliased mode.
     pub opacities: Array,
 }
 
@@ -95,7 +95,7 @@ pub fn run(
     })
 }
 
-/// The sum of all outputs under the scene's weights.
+/// Sum of all outputs with the scene's weights.
 fn loss(
     scene: &Scene,
     upload: &Upload,
@@ -115,7 +115,7 @@ fn loss(
     }
 }
 
-/// The inputs of a scene on a device, cameras in front.
+/// Inputs of a scene on a device, with a camera dimension in front.
 struct Leaves {
     means: Tensor<2>,
     quats: Tensor<2>,
@@ -172,14 +172,14 @@ impl Leaves {
         }
     }
 
-    /// Colours `[C, N, 3]`, seen from the camera centre -W^T t.
+    /// Colours `[C, N, 3]` for the camera centre -W^T t.
     fn colors(&self, scene: &Scene, bug: Option<Bug>) -> Result<Tensor<3>, OpError> {
         let (c, n) = (scene.cameras, scene.gaussians);
         let rotation = self.viewmats.clone().narrow(1, 0, 3).narrow(2, 0, 3); // [C, 3, 3]
         let translation = self.viewmats.clone().narrow(1, 0, 3).narrow(2, 3, 1); // [C, 3, 1]
         let centre = (rotation * translation).sum_dim(1).neg(); // [C, 1, 3]
         // Repeated rather than broadcast, and `-1` rather than N: with N = 0, `expand` panics and
-        // `reshape` reads the 0 as "keep the length of this dimension".
+        // `reshape` reads the 0 as "keep this dimension".
         let mut directions = self.means.clone().reshape([1, -1, 3]).repeat_dim(0, c) // [C, N, 3]
             - centre.repeat_dim(1, n);
         if bug == Some(Bug::DirectionDetached) {
@@ -189,8 +189,8 @@ impl Leaves {
         Ok(colors.add_scalar(0.5).clamp_min(0.0))
     }
 
-    /// The picture, whose fourth channel is the depth where there is a loss of it, and the
-    /// opacities at the rasteriser.
+    /// The image, whose fourth channel is the depth if the loss uses it, and the opacities passed
+    /// to the rasteriser.
     fn render(
         &self,
         scene: &Scene,
@@ -200,7 +200,7 @@ impl Leaves {
         let c = scene.cameras;
         let colors = self.colors(scene, bug)?;
         let backdrop = self.background.clone().reshape([1, 3]).expand([c, 3]);
-        // Depth is one more colour, over a background of zero.
+        // Depth is an additional colour on a background of zero.
         let (colors, backdrop) = match scene.upstream.depth {
             None => (colors, backdrop),
             Some(_) => {
@@ -247,21 +247,21 @@ impl Leaves {
     }
 }
 
-/// The same values, with the gradients of a backward that forgets to differentiate q / |q|.
+/// The same values, with the gradients of a backward pass that forgets to differentiate q / |q|.
 ///
 /// The quaternion that reaches the op has the value q / |q| but passes its gradient to q unchanged.
-/// The unnormalised rotation matrix grows with the square of the quaternion's length, so the part
-/// along it is that of a scale of |q|^2.
+/// The unnormalised rotation matrix grows with the square of the quaternion's length, so the
+/// component along it is that of a scale of |q|^2.
 fn quaternion_normalisation_skipped(quats: Tensor<2>, scales: Tensor<2>) -> (Tensor<2>, Tensor<2>) {
     let length = quats.clone().square().sum_dim(1).sqrt();
     let unit = (quats.clone() / length).detach();
-    // The difference first: it is exactly zero in every precision.
+    // The difference comes first: it is exactly zero in every precision.
     let quats = unit + (quats.clone() - quats.detach());
     let square = quats.clone().square().sum_dim(1);
     (quats, scales * square)
 }
 
-/// The same screen splats, with half the gradient into w21.
+/// The same screen splats, with half the gradient of w21.
 fn off_diagonal_halved(projected: &Projected) -> Result<Projected, OpError> {
     let packed = projected.packed();
     let w21 = packed.clone().narrow(2, 4, 1);
@@ -317,7 +317,7 @@ impl Download<'_> {
         })
     }
 
-    /// No gradient at all is a gradient of zero; the judge decides whether that is right.
+    /// A missing gradient counts as zero; the judge decides whether that is right.
     fn gradient<const D: usize>(
         &self,
         gradient: Option<Tensor<D>>,

@@ -1,10 +1,10 @@
-//! What is rendered and differentiated in a check: a scene, its cameras, and a loss.
+//! Input of a check: a scene, its cameras, and a loss.
 
 use std::path::PathBuf;
 
 use splat_ops::{ImageSize, ProjectSettings, RasterizeSettings};
 
-/// A tensor on the host, in double precision, row-major.
+/// A row-major tensor on the host, in double precision.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Array {
     /// Lengths of the dimensions.
@@ -22,7 +22,7 @@ impl Array {
         }
     }
 
-    /// Root mean square of the elements; 0 when there are none.
+    /// Root mean square of the elements; 0 if there are none.
     pub fn rms(&self) -> f64 {
         if self.values.is_empty() {
             return 0.0;
@@ -52,32 +52,31 @@ pub struct Inputs {
     pub background: Array,
 }
 
-/// Rendered pictures of a fixture, or their upstream gradients; C in front where the viewmat has
-/// it.
+/// Images of a fixture, or their upstream gradients; with a leading C if the viewmat has it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Outputs {
     /// `[H, W, 3]`.
     pub image: Array,
     /// `[H, W, 1]`.
     pub alpha: Array,
-    /// `[H, W, 1]`, accumulated camera z. Present when the fixture has a depth loss or picture.
+    /// `[H, W, 1]`, accumulated camera z. Present if the fixture has a depth loss or image.
     pub depth: Option<Array>,
 }
 
-/// A scene, its cameras, and the gradients of a loss to its pictures.
+/// A scene, its cameras, and the gradients of a loss with respect to the images.
 #[derive(Debug, Clone)]
 pub struct Scene {
-    /// The file it was read from, or the case that made it. For messages.
+    /// File or case of origin, for messages.
     pub source: PathBuf,
     /// C.
     pub cameras: usize,
     /// N.
     pub gaussians: usize,
-    /// Size of the picture.
+    /// Size of the image.
     pub size: ImageSize,
     /// Degree of spherical harmonics to evaluate.
     pub sh_degree: usize,
-    /// Whether opacities are multiplied by the compensation of the low-pass filter.
+    /// True if opacities are multiplied by the compensation of the low-pass filter.
     pub antialias: bool,
     /// Settings of the projection.
     pub project: ProjectSettings,
@@ -85,7 +84,7 @@ pub struct Scene {
     pub rasterize: RasterizeSettings,
     /// Gaussians and cameras.
     pub inputs: Inputs,
-    /// Gradients of the loss to the pictures.
+    /// Gradients of the loss with respect to the images.
     pub upstream: Outputs,
 }
 

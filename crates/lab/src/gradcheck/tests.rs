@@ -1,11 +1,12 @@
-//! A check as a whole, on fixtures that are made here.
+//! Complete checks, on fixtures made here.
 
 use burn::tensor::Device;
 
 use super::*;
 use crate::accuracy::Sketch;
 
-/// Of degree 1 the first four rows are used: a file may hold no more, or some that nothing reads.
+/// Degree 1 uses the first four rows: a file may contain no more, or further ones that nothing
+/// reads.
 #[test]
 fn any_number_of_coefficients_is_checked() {
     let mut sketch = Sketch::new("rows", 16, 16, 3);

@@ -1,26 +1,26 @@
-//! Walks every pixel of a scene splat by splat: counts the work, and the pixels where one rounding
-//! error more or less decides whether a splat is blended.
+//! Walks every pixel of a scene splat by splat, counting the work and the pixels where one rounding
+//! error decides whether a splat is blended.
 
 use super::rounding;
 use super::run::Computed;
 use super::scene::Scene;
 
-/// Relative distance to a threshold that counts as near.
+/// Relative distance that counts as near a threshold.
 pub const NEAR: f64 = 1e-6;
 
-/// What a walk over all pixels of all cameras counts.
+/// Counts of a walk over all pixels of all cameras.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Walk {
-    /// Pixels where some alpha or transmittance lies near the threshold it is compared with.
+    /// Pixels where some alpha or transmittance is near its threshold.
     pub near_threshold: usize,
-    /// (Pixel, splat) pairs with an alpha of at least `alpha_min`, up to where the pixel stops.
+    /// (Pixel, splat) pairs with an alpha of at least `alpha_min`, up to the stop of the pixel.
     pub seen: u64,
-    /// Those of them that were blended.
+    /// Pairs that were blended.
     pub blended: u64,
 }
 
-/// Walks every splat against every pixel, in double precision, from the screen splats of
-/// `computed`. A value within `near` of a threshold, relatively, is near it.
+/// Walks every splat at every pixel, in double precision, from the screen splats of `computed`. A
+/// value within a relative `near` of a threshold counts as near it.
 pub fn walk(scene: &Scene, computed: &Computed, near: f64) -> Walk {
     let mut total = Walk::default();
     walk_pixels(scene, computed, Margin::Relative(near), |_, pixel| {
@@ -31,9 +31,9 @@ pub fn walk(scene: &Scene, computed: &Computed, near: f64) -> Walk {
     total
 }
 
-/// The pixels that single precision may decide differently, as indices into `[C, H, W]`: there an
-/// alpha or a transmittance of `computed`, which is in double precision, lies within single
-/// precision's rounding of a threshold.
+/// Pixels that single precision may decide differently, as indices into `[C, H, W]`: an alpha or a
+/// transmittance of `computed`, which is in double precision, lies within rounding of a threshold
+/// there.
 pub fn near_in_single(scene: &Scene, computed: &Computed) -> Vec<usize> {
     let mut found = vec![];
     walk_pixels(scene, computed, Margin::Single, |index, pixel| {
@@ -44,17 +44,17 @@ pub fn near_in_single(scene: &Scene, computed: &Computed) -> Vec<usize> {
     found
 }
 
-/// What counts as near a threshold.
+/// Criterion for being near a threshold.
 #[derive(Clone, Copy)]
 enum Margin {
-    /// A relative distance.
+    /// By relative distance.
     Relative(f64),
-    /// What single precision may round across it.
+    /// Within the rounding of single precision.
     Single,
 }
 
 impl Margin {
-    /// Whether a value that single precision knows up to `error` lies near a threshold.
+    /// True if a value known up to `error` in single precision is near a threshold.
     fn holds(self, value: f64, error: f64, threshold: f64) -> bool {
         match self {
             Self::Relative(near) => (value - threshold).abs() <= near * threshold,
@@ -70,14 +70,14 @@ impl Margin {
 
 /// A splat on the screen of one camera.
 struct ScreenSplat<'a> {
-    /// As [`Projected::packed`](splat_ops::Projected::packed) has it.
+    /// In the layout of [`Projected::packed`](splat_ops::Projected::packed).
     row: &'a [f64],
     opacity: f64,
     /// Error of the screen mean in single precision.
     mean_error: [f64; 2],
 }
 
-/// What becomes of one pixel.
+/// State of one pixel.
 #[derive(Default)]
 struct Pixel {
     near: bool,

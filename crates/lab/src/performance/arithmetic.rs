@@ -1,5 +1,5 @@
-//! What the blending could reach on this machine at this time: tiles full of splats, everything in
-//! cache.
+//! Upper limit of the blending speed on this machine at this time: tiles full of splats, with
+//! everything in cache.
 
 use std::panic::resume_unwind;
 use std::thread;
@@ -14,15 +14,15 @@ use super::{PerformanceError, Spread, on_threads};
 
 /// Side of a tile in pixels.
 const TILE: u32 = 16;
-/// Splats, each of which every pixel of the tile blends.
+/// Splats, all blended by every pixel of the tile.
 const SPLATS: usize = 256;
-/// Tiles per pass, each an image of its own.
+/// Tiles per pass, each its own image.
 const TILES: usize = 64;
-/// Passes that are measured, after one that is not.
+/// Measured passes, after one that is not measured.
 const PASSES: usize = 30;
 
-/// 1e9 pairs per second and thread, forward and backward: the rasteriser's own loops without lists
-/// to walk, spans to find, or memory to wait for.
+/// 1e9 pairs per second and thread, forward and backward, of the rasteriser's own loops without
+/// lists to walk, spans to find, or memory to wait for.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Arithmetic {
     /// Blending.
@@ -31,7 +31,7 @@ pub struct Arithmetic {
     pub backward: f64,
 }
 
-/// Measures on so many threads of the CPU at once, each by itself: their mean.
+/// Mean of the given number of threads measuring at once, each on its own.
 pub(super) fn measure(threads: usize) -> Result<Arithmetic, PerformanceError> {
     let rates: Result<Vec<Arithmetic>, PerformanceError> = thread::scope(|scope| {
         let threads: Vec<_> = (0..threads).map(|_| scope.spawn(alone)).collect();
@@ -90,8 +90,8 @@ fn alone() -> Result<Arithmetic, PerformanceError> {
     })
 }
 
-/// Packed splats, colours and opacities of every tile, tracked. So wide that every pixel passes
-/// every test, and so faint that light is left behind the last one.
+/// Tracked packed splats, colours and opacities of every tile: wide enough that every pixel passes
+/// every test, and faint enough that light remains behind the last one.
 fn splats(device: &Device) -> [Tensor<3>; 3] {
     let (deviation, middle) = (20.0, TILE as f32 / 2.0);
     let tensor = |width: usize, row: &dyn Fn(usize) -> Vec<f32>| {

@@ -1,9 +1,8 @@
-//! Memory that training takes on a CubeCL device, by the allocator's own count.
+//! Memory used by training on a CubeCL device, by the allocator's own count.
 //!
-//! Between steps there are, of every Gaussian of degree 3: 59 floats that are trained, two moments
-//! of each, and two sums for density control. Within a step come its gradients, what is projected,
-//! and what the rasteriser keeps; of the latter `splat_kernels::rasterize::Kept` has the bytes per
-//! Gaussian, intersection and pixel.
+//! Between steps, a Gaussian of degree 3 keeps 59 trained floats, two moments of each, and two sums
+//! for density control. A step adds gradients, projected splats, and the state of the rasteriser,
+//! whose bytes per Gaussian, intersection and pixel are in `splat_kernels::rasterize::Kept`.
 
 use burn::tensor::Device;
 use serde::{Deserialize, Serialize};
@@ -11,16 +10,16 @@ use serde::{Deserialize, Serialize};
 use super::PerformanceError;
 use splat_trainer::Trainer;
 
-/// Floats of a Gaussian that are trained: mean, scale, rotation, opacity, colour; and the
-/// coefficients of the higher degrees, all of them as soon as one is evaluated.
+/// Trained floats of a Gaussian: mean, scale, rotation, opacity, colour; and the coefficients of
+/// the higher degrees, all of them once one is evaluated.
 pub(super) const fn parameters(sh_degree: usize) -> u64 {
     let higher = if sh_degree == 0 { 0 } else { 45 };
     3 + 3 + 4 + 1 + 3 + higher
 }
 
-/// Bytes of a Gaussian of degree 3 between steps.
+/// Bytes per Gaussian of degree 3 between steps.
 pub const PER_GAUSSIAN_AT_REST: u64 = 4 * (3 * parameters(3) + 2);
-/// What they shall not exceed: a million in 1.2 GB.
+/// Goal for the bytes per Gaussian between steps: a million in 1.2 GB.
 pub const PER_GAUSSIAN_GOAL: u64 = 1200;
 
 /// Memory of a run.
@@ -28,18 +27,18 @@ pub const PER_GAUSSIAN_GOAL: u64 = 1200;
 pub struct DeviceMemory {
     /// Gaussians of the run.
     pub gaussians: u64,
-    /// Bytes in use between two steps, without what others had in use before the run.
+    /// Bytes in use between two steps, excluding those in use before the run.
     pub at_rest_bytes: u64,
-    /// The most seen in use at the beginning or end of a stage, likewise. Within a stage it may be
-    /// more.
+    /// Peak bytes in use at the beginning or end of a stage, excluding those in use before the run.
+    /// Within a stage it may be more.
     pub most_bytes: u64,
-    /// Bytes that the allocator has taken from the device so far, for whatever will be needed.
+    /// Bytes that the allocator has reserved from the device so far.
     pub reserved_bytes: u64,
 }
 
 impl DeviceMemory {
-    /// Of a run between two steps, `before` bytes in use when it began and `most` during some of
-    /// its steps.
+    /// Memory of a run between two steps, with `before` bytes in use when it began and `most`
+    /// during its steps.
     pub(super) fn of(
         trainer: &Trainer,
         device: &Device,
@@ -57,7 +56,7 @@ impl DeviceMemory {
         })
     }
 
-    /// So many bytes as a share of one Gaussian.
+    /// Bytes divided by the number of Gaussians.
     pub fn per_gaussian(&self, bytes: u64) -> f64 {
         bytes as f64 / self.gaussians.max(1) as f64
     }

@@ -1,5 +1,5 @@
-//! A training step on a CubeCL device: its time, what the kernels were asked to do, how near it
-//! comes to what the device's memory allows, and the memory it takes.
+//! A training step on a CubeCL device: its time, the work of the kernels, the share of the device's
+//! memory bandwidth, and memory.
 
 use std::fmt::Write;
 use std::sync::Arc;
@@ -18,28 +18,28 @@ use super::{Machine, PerformanceError, Spread, Work};
 use splat_data::Capture;
 use splat_trainer::TrainSettings;
 
-/// Steps before the clock starts: kernels are compiled, and spherical harmonics reach their degree.
+/// Unmeasured steps: kernels are compiled, and spherical harmonics reach their degree.
 const WARM_UP: usize = 5;
 /// Steps measured in each way, unless time is up; at least [`LEAST`].
 const STEPS: usize = 50;
 const LEAST: usize = 3;
-/// Bytes of the copy that measures the device's memory: more than the caches of today's devices.
+/// Bytes of the copy that measures bandwidth: more than the caches of current devices.
 const COPY_BYTES: usize = 256 << 20;
-/// The same on a device that is a processor, whose caches are smaller and whose time is short.
+/// The same for a software device, which has smaller caches and less speed.
 const SOFTWARE_COPY_BYTES: usize = 64 << 20;
 
-/// The training step of a capture's first Gaussians on a device.
+/// The training step of a capture's initial Gaussians on a device.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct DeviceStepReport {
-    /// Where and when.
+    /// Machine and date.
     pub machine: Machine,
-    /// What is known of the device, and which variant of the kernels runs there.
+    /// Properties of the device, and the kernel variants that run on it.
     pub device: Vec<(&'static str, String)>,
     /// Name of the capture.
     pub capture: String,
-    /// The work of a view, as the device's kernels do it.
+    /// Work per view of the device's kernels.
     pub work: Work,
-    /// Bytes per second, read and written together, of a plain copy.
+    /// Bytes read and written per second by a plain copy.
     pub copy_bytes_per_second: f64,
     /// One per degree of spherical harmonics.
     pub rows: Vec<DeviceStepRow>,
@@ -50,52 +50,51 @@ pub struct DeviceStepReport {
 pub struct DeviceStepRow {
     /// Degree of spherical harmonics.
     pub sh_degree: usize,
-    /// Steps measured, in each of three ways.
+    /// Steps measured in each of three ways.
     pub steps: usize,
-    /// Time of a step, begun on an idle device and ended when the device is idle again.
+    /// Time of a step, from an idle device to an idle device.
     pub milliseconds: Spread,
-    /// Mean time of steps that follow each other as in training, the last waited for.
+    /// Mean time of consecutive steps, as in training, with a wait after the last.
     pub milliseconds_in_a_row: f64,
-    /// Launches of our kernels per step, waits of the host for them, intersections listed, bytes
-    /// reserved.
+    /// Launches of our kernels per step.
     pub launches: f64,
-    /// How often the host waited.
+    /// Waits of the host per step.
     pub waits: f64,
-    /// (tile, Gaussian) pairs listed.
+    /// (tile, Gaussian) pairs listed per step.
     pub intersections: f64,
-    /// Bytes our kernels reserved.
+    /// Bytes reserved by our kernels per step.
     pub reserved_bytes: f64,
-    /// Bytes that the kernels cannot do without, by stage.
+    /// Floor of each stage in bytes.
     pub floor: Vec<(&'static str, u64)>,
-    /// Those of all stages.
+    /// Sum of the stages' floors.
     pub floor_bytes: u64,
-    /// Share of a step in a row that a copy would need to move them.
+    /// Time of a copy of the floor's bytes, as a share of a consecutive step.
     pub share_of_floor: f64,
-    /// Median time of each stage, in the order in which they end; last what no stage covers. The
-    /// device was waited for before and after every stage.
+    /// Median time of each stage, in the order of completion, and finally the time outside all
+    /// stages. Measured with a wait for the device before and after every stage.
     pub stages: Vec<(String, f64)>,
     /// Memory on the device.
     pub memory: DeviceMemory,
 }
 
-/// Whether a device is no hardware of its own but a program on the host.
+/// True for a device that is a program on the host rather than hardware.
 #[cfg(any(feature = "wgpu", feature = "cuda"))]
 fn is_software(device: &Device) -> bool {
     let identity = device.identity();
     identity.is_none_or(|known| known.physical.is_none())
 }
 
-/// Without a feature that reaches other devices there is the host alone.
+/// Without a feature for other devices there is only the host.
 #[cfg(not(any(feature = "wgpu", feature = "cuda")))]
 fn is_software(_: &Device) -> bool {
     true
 }
 
-/// Measures steps of `capture` on `device` at degree 0, with which training begins, and 3, with
-/// which it ends. `seconds` bounds the time of each way of measuring, as far as three steps do.
+/// Measures steps of `capture` on `device` at degree 0, where training begins, and 3, where it
+/// ends. `seconds` limits the time of each way of measuring, beyond the first three steps.
 ///
 /// # Errors
-/// When the capture cannot be trained on, or the device is none of CubeCL or fails.
+/// When the capture cannot be trained, or the device is not CubeCL's or fails.
 pub fn measure(
     capture: &Arc<Capture>,
     config: &TrainSettings,
@@ -131,22 +130,22 @@ pub fn measure(
     })
 }
 
-/// What was measured of the steps of a run.
+/// Measurements of a run's steps.
 pub(super) struct DeviceRun {
-    /// Each waited for.
+    /// Steps with a wait after each.
     pub(super) alone: Vec<f64>,
-    /// Seconds of so many, the last waited for.
+    /// Seconds of the consecutive steps, with a wait after the last.
     in_a_row: f64,
     launches: f64,
     waits: f64,
     intersections: f64,
     reserved_bytes: f64,
-    /// With the device waited for before and after every stage.
+    /// Stages with a wait for the device before and after each.
     pub(super) staged: Samples,
     pub(super) memory: DeviceMemory,
 }
 
-/// Takes `warm_up` steps and then measures some more.
+/// Takes `warm_up` steps, then measures.
 pub(super) fn run(
     capture: &Arc<Capture>,
     config: &TrainSettings,
@@ -242,7 +241,7 @@ impl DeviceRun {
 }
 
 impl DeviceStepReport {
-    /// The tables.
+    /// The result as tables.
     pub fn markdown(&self) -> String {
         let mut text = String::new();
         // Writing into a string cannot fail.
@@ -359,7 +358,7 @@ impl DeviceStepReport {
     }
 }
 
-/// What is known of a device, as a list.
+/// Properties of a device, as a list.
 pub(super) fn write_device(
     text: &mut String,
     facts: &[(&'static str, String)],

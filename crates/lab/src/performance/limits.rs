@@ -1,14 +1,14 @@
-//! What the arithmetic of the rasteriser's inner loop reached where nothing else is in its way.
+//! Reference speeds of the rasteriser's inner loops, with nothing else in their way.
 
 use splat_ops::cpu::InstructionSet;
 
 /// 1e9 evaluations per second and core.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Limit {
-    /// What the arithmetic of the inner loop reached on a machine with AVX-512: a tile of 16 x 16
-    /// pixels with 256 splats, in cache, forward and backward. Not all of it was measured.
+    /// Measured speed of the inner loop's arithmetic on a machine with AVX-512: a tile of 16 x 16
+    /// pixels with 256 splats, in cache, forward and backward. Not all values were measured.
     pub reached: [Option<f64>; 2],
-    /// What the rasteriser shall reach, forward and backward.
+    /// Goals of the rasteriser, forward and backward.
     pub goal: Option<[f64; 2]>,
 }
 
@@ -27,11 +27,11 @@ const BASELINE: Limit = Limit {
     goal: None,
 };
 
-/// The same of scalar code with libm, forward.
+/// Speed of scalar code with libm, forward.
 pub(super) const SCALAR: f64 = 0.1;
 
-/// The limit of the instructions that ran. None was measured for NEON, whose vectors are half of
-/// AVX2's; it is held against AVX2.
+/// Limit of the running instruction set. None was measured for NEON, whose vectors are half of
+/// AVX2's; it is compared with AVX2.
 pub(super) fn limit(instructions: InstructionSet) -> Limit {
     match instructions {
         InstructionSet::Avx512 => AVX512,

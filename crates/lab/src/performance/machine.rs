@@ -1,4 +1,4 @@
-//! What the figures were measured on, and what the system says about this process.
+//! Description of the machine, and resource use of this process.
 
 use std::time::{SystemTime, UNIX_EPOCH};
 
@@ -14,14 +14,14 @@ pub struct Machine {
     pub date: String,
     /// Processor, threads, system.
     pub name: String,
-    /// Instructions that the inner loops ran with.
+    /// Instruction set of the inner loops.
     pub instructions: String,
-    /// Wide instructions that the processor has.
+    /// Wide instruction sets of the processor.
     pub available: Vec<&'static str>,
 }
 
 impl Machine {
-    /// This one, now.
+    /// This machine, now.
     pub fn here() -> Self {
         let since = SystemTime::now().duration_since(UNIX_EPOCH);
         Self {
@@ -32,7 +32,7 @@ impl Machine {
         }
     }
 
-    /// One line.
+    /// One-line description.
     pub fn line(&self) -> String {
         let available = match &self.available[..] {
             [] => "none that is known here".to_owned(),
@@ -65,8 +65,8 @@ fn available() -> Vec<&'static str> {
     }
 }
 
-/// The day that is so many days after 1970-01-01, in the Gregorian calendar. Years begin in March,
-/// so that the leap day is the last of a year; 400 of them are 146,097 days.
+/// Gregorian date of a number of days after 1970-01-01. Years begin in March, so that the leap day
+/// is the last of a year; 400 years are 146,097 days.
 fn date(days: u64) -> String {
     let days = days + 719_468;
     let (era, day) = (days / 146_097, days % 146_097);
@@ -82,22 +82,22 @@ fn date(days: u64) -> String {
     format!("{:04}-{month:02}-{day:02}", era * 400 + year)
 }
 
-/// What a process has used of the machine.
+/// Resources used by a process.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) struct Usage {
-    /// Pages touched for the first time, or again after they were given back.
+    /// Pages touched for the first time, or again after being returned.
     pub(super) page_faults: f64,
-    /// Processor time of all threads, in hundredths of a second.
+    /// Processor time of all threads, with a resolution of a hundredth of a second.
     pub(super) cpu_seconds: f64,
 }
 
 impl Usage {
-    /// Of this process so far; `None` where the system does not say. Known on Linux.
+    /// Usage of this process so far, on Linux; `None` elsewhere.
     pub(super) fn so_far() -> Option<Self> {
         Self::parse(&std::fs::read_to_string("/proc/self/stat").ok()?)
     }
 
-    /// Since an earlier moment.
+    /// Usage since an earlier moment.
     pub(super) fn since(self, earlier: Self) -> Self {
         Self {
             page_faults: self.page_faults - earlier.page_faults,
@@ -105,8 +105,8 @@ impl Usage {
         }
     }
 
-    /// The tenth field of `/proc/self/stat`, and the sum of the fourteenth and fifteenth, in the
-    /// system's fixed ticks of 10 ms; the second is a name in brackets that may hold anything.
+    /// Parses the tenth field of `/proc/self/stat`, and the sum of the fourteenth and fifteenth, in
+    /// ticks of 10 ms; the second field is a name in brackets with arbitrary contents.
     fn parse(stat: &str) -> Option<Self> {
         let (_, after_name) = stat.rsplit_once(')')?;
         let fields: Vec<&str> = after_name.split_whitespace().collect();

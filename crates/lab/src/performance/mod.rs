@@ -1,9 +1,8 @@
-//! How fast it is, what the time goes to, and how that grows: `splat bench step|rasterize|scaling`,
-//! on the CPU or on a CubeCL device.
+//! Speed, its breakdown by stage, and its growth: `splat bench step|rasterize|scaling`, on the CPU
+//! or a CubeCL device.
 //!
-//! Nothing here is a copy of what it measures: steps are those of the
-//! [`Trainer`](splat_trainer::Trainer), and their stages are the `tracing` spans in it and in the
-//! ops.
+//! Nothing here duplicates the measured code: steps are those of the
+//! [`Trainer`](splat_trainer::Trainer), and stages are the `tracing` spans in it and in the ops.
 
 mod arithmetic;
 mod device_memory;
@@ -31,10 +30,10 @@ use splat_ops::OpError;
 
 use splat_trainer::TrainError;
 
-/// What keeps a measurement from being made.
+/// Why a measurement cannot be made.
 #[derive(Debug, thiserror::Error)]
 pub enum PerformanceError {
-    /// A step could not be taken.
+    /// A training step failed.
     #[error(transparent)]
     Train(#[from] TrainError),
     /// An op refused its input.
@@ -43,20 +42,20 @@ pub enum PerformanceError {
     /// Threads could not be started.
     #[error("threads: {0}")]
     Threads(#[from] rayon::ThreadPoolBuildError),
-    /// A device stopped working.
+    /// A device failed.
     #[error("the device: {0}")]
     Device(#[from] ExecutionError),
-    /// A figure of CubeCL devices was asked of another.
+    /// A figure for CubeCL devices was requested for another device.
     #[error("the device is none of CubeCL's; choose one with --device wgpu or --device cuda")]
     NotCubeCl,
-    /// The process that measures a point of the scaling did not.
+    /// The process that measures a point of the scaling failed.
     #[error("{gaussians} Gaussians, {size} pixels: {reason}")]
     Point {
         /// Gaussians of the point.
         gaussians: usize,
-        /// Its photos.
+        /// Size of its photos.
         size: scaling::PhotoSize,
-        /// What went wrong.
+        /// The reason.
         reason: String,
     },
 }

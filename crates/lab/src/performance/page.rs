@@ -6,7 +6,7 @@ use super::rasterize::RasterizeReport;
 use super::scaling::ScalingReport;
 use super::step::StepReport;
 
-/// Everything that is measured.
+/// All measurements.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct PerformanceReport {
     /// The training step.
@@ -19,7 +19,7 @@ pub struct PerformanceReport {
 
 impl PerformanceReport {
     /// The page. `arguments` are those of the command that writes it, of `bench step`, and of
-    /// `bench rasterize`, each with a space before.
+    /// `bench rasterize`, each with a leading space.
     pub fn markdown(&self, arguments: [&str; 3]) -> String {
         let [all, step, rasterize] = arguments;
         let bench = "cargo run --release -- bench";

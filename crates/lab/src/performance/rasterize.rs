@@ -1,5 +1,5 @@
-//! The rasteriser: (pixel, Gaussian) evaluations per second and core (or per CubeCL device), on the
-//! lists of a real scene.
+//! Speed of the rasteriser: (pixel, Gaussian) evaluations per second and core (or per CubeCL
+//! device), on the lists of a real scene.
 
 use std::fmt::Write;
 use std::time::{Duration, Instant};
@@ -23,68 +23,67 @@ use splat_trainer::photo;
 
 /// Views rendered.
 const VIEWS: usize = 8;
-/// Passes over the views before the clock starts.
+/// Unmeasured passes over the views.
 const WARM_UP: usize = 1;
-/// Passes over the views that are measured, unless time is up.
+/// Measured passes over the views, unless time is up.
 const PASSES: usize = 30;
 
 /// The rasteriser on the views of a capture.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RasterizeReport {
-    /// Where and when.
+    /// Machine and date.
     pub machine: Machine,
-    /// What is known of the CubeCL device that rendered; absent where it was the CPU.
+    /// Properties of the CubeCL device; absent for the CPU.
     pub device: Option<Vec<(&'static str, String)>>,
-    /// What was rendered.
+    /// The rendered scene.
     pub scene: String,
     /// The work of a view.
     pub work: Work,
-    /// One per number of threads and set of instructions; one of one thread for a device.
+    /// One row per number of threads and instruction set; a single row for a device.
     pub rows: Vec<RasterizeRow>,
 }
 
-/// A number of threads that run the same instructions.
+/// Results for a number of threads and an instruction set.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RasterizeRow {
     /// Threads.
     pub threads: usize,
-    /// What the inner loops ran with; absent where a device rendered.
+    /// Instruction set of the inner loops; absent for a device.
     pub instructions: Option<String>,
-    /// What they are held against.
+    /// Reference speeds.
     #[serde(skip)]
     limit: Option<Limit>,
     /// Passes over the views.
     pub passes: usize,
-    /// Tile lists, milliseconds per view. Absent where the rasteriser does not time them apart from
-    /// the blending.
+    /// Tile lists, milliseconds per view. Absent if the rasteriser does not time them separately.
     pub lists: Option<Spread>,
-    /// Blending, with the lists where these are not apart.
+    /// Blending, including the lists if they are not separate.
     pub forward: Rate,
-    /// Its gradient.
+    /// The gradient of the blending.
     pub backward: Rate,
-    /// Its gradient again, summed as it comes; of a CubeCL device only.
+    /// The gradient with unordered sums; CubeCL devices only.
     pub backward_unordered: Option<Rate>,
-    /// What the order costs: the time of `backward` by that of `backward_unordered`, one after the
-    /// other on each view and summed over the views of a pass.
+    /// Cost of ordered sums: the time of `backward` divided by that of `backward_unordered`,
+    /// alternating on each view and summed over the views of a pass.
     pub cost_of_order: Option<Spread>,
-    /// What so many threads of the CPU reach side by side without lists, spans and memory; absent
-    /// where a device rendered.
+    /// Speed of the same number of CPU threads without lists, spans and memory; absent for a
+    /// device.
     pub possible: Option<Arithmetic>,
-    /// Milliseconds per view of projection, colours and rasteriser together, and of their
-    /// gradients; of a CubeCL device only, idle before and after.
+    /// Milliseconds per view of projection, colours and rasteriser together, from an idle device to
+    /// an idle device; CubeCL devices only.
     pub render_forward_milliseconds: Option<Spread>,
-    /// See above.
+    /// The same for their gradients.
     pub render_backward_milliseconds: Option<Spread>,
 }
 
-/// How fast the evaluations of a view are done. Both directions count those of the forward pass.
+/// Speed of a view's evaluations. Both directions count those of the forward pass.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct Rate {
     /// Milliseconds per view.
     pub milliseconds: Spread,
-    /// Pairs tested per second and thread, in the median time.
+    /// Pairs tested per second and thread, at the median time.
     pub tested_per_second: f64,
-    /// Pairs blended per second and thread, in the median time.
+    /// Pairs blended per second and thread, at the median time.
     pub blended_per_second: f64,
 }
 
@@ -100,9 +99,9 @@ impl Rate {
     }
 }
 
-/// Measures the rasteriser of `device` on up to eight of `views`, that of the CPU on one thread and
-/// on all; `seconds` bounds the time of each. A CubeCL device is waited for where the rasteriser
-/// begins and ends.
+/// Measures the rasteriser of `device` on up to eight of `views`; for the CPU, on one thread and on
+/// all. `seconds` limits the time of each. For a CubeCL device, the rasteriser is timed from idle
+/// to idle.
 ///
 /// # Errors
 /// When the scene cannot be rendered.
@@ -192,13 +191,13 @@ pub fn measure(
     })
 }
 
-/// Time of the rasteriser's spans over all views, and of the whole render on a CubeCL device.
+/// Times of the rasteriser's spans over all views, and of the whole render on a CubeCL device.
 #[derive(Default)]
 struct Pass {
     lists: Duration,
     forward: Duration,
     backward: Duration,
-    /// `backward`, summed as it comes.
+    /// `backward` with unordered sums.
     unordered: Duration,
     render_forward: Duration,
     render_backward: Duration,
@@ -216,7 +215,7 @@ impl Pass {
         }
     }
 
-    /// Of the same views, summed as it comes.
+    /// Adds the times of the same views with unordered sums.
     fn add_unordered(&mut self, stages: &[Stage]) {
         let gradients = stages
             .iter()
@@ -229,8 +228,8 @@ impl Pass {
     }
 }
 
-/// Renders the views and goes back through them, again and again; a CubeCL device three times:
-/// waited for by stages, with sums in order and without, and as a whole.
+/// Renders the views and their gradients repeatedly. A CubeCL device does so three times: by stages
+/// with ordered sums, by stages with unordered sums, and as a whole.
 fn passes(
     data: &SplatData,
     views: &[&View],
@@ -270,7 +269,7 @@ fn passes(
                     difference.square().mean().backward();
                     Ok(recording.take())
                 };
-                // What comes first on one view comes second on the next.
+                // The order alternates between views.
                 let first = unordered.as_ref().filter(|_| (number + at) % 2 == 0);
                 if let Some(settings) = first {
                     pass.add_unordered(&stages(settings)?);
@@ -293,7 +292,7 @@ fn passes(
         return Recording::of(record);
     };
     let mut passes: Vec<Pass> = Recording::on_device(&device, record)?;
-    // Nobody listens now, so that within these the device is not waited for.
+    // No subscriber is active here, so the device is not waited for inside.
     for pass in &mut passes {
         for (cameras, photo) in &inputs {
             device.sync()?;
@@ -313,7 +312,7 @@ fn passes(
 }
 
 impl RasterizeReport {
-    /// The tables.
+    /// The result as tables.
     pub fn markdown(&self) -> String {
         let mut text = String::new();
         // Writing into a string cannot fail.

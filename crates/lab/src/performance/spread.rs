@@ -1,20 +1,20 @@
-//! What many runs of one thing took.
+//! Statistics of repeated measurements.
 
 use serde::{Deserialize, Serialize};
 
-/// Median and range of a number of measurements.
+/// Median and range of measurements.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Spread {
-    /// Half of them are no greater.
+    /// The median.
     pub median: f64,
-    /// The least.
+    /// The smallest.
     pub min: f64,
-    /// The greatest.
+    /// The largest.
     pub max: f64,
 }
 
 impl Spread {
-    /// Of some measurements; NaN where there is none.
+    /// Statistics of measurements; NaN if there are none.
     pub fn of(mut values: Vec<f64>) -> Self {
         values.sort_by(f64::total_cmp);
         let at = |index: usize| values.get(index).copied().unwrap_or(f64::NAN);
@@ -26,7 +26,7 @@ impl Spread {
         }
     }
 
-    /// All three, times `factor`.
+    /// All three values times `factor`.
     pub fn times(self, factor: f64) -> Self {
         Self {
             median: factor * self.median,

@@ -1,4 +1,4 @@
-//! How long the stages of a piece of work take, by their `tracing` spans.
+//! Times of the stages of some work, by their `tracing` spans.
 
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
@@ -10,22 +10,22 @@ use tracing::{Subscriber, span};
 use tracing_subscriber::layer::{Context, Layer, SubscriberExt};
 use tracing_subscriber::registry::{LookupSpan, Registry};
 
-/// The spans of one name.
+/// All spans of one name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Stage {
     /// Their name.
     pub name: &'static str,
-    /// Time in them, but in no span inside of them.
+    /// Time in them, excluding nested spans.
     pub own: Duration,
-    /// Time in them.
+    /// Time in them, including nested spans.
     pub whole: Duration,
 }
 
-/// Spans that have ended since it was last taken, in the order in which their names first did.
+/// Spans that have ended since the last `take`, in the order in which their names first ended.
 #[derive(Debug, Clone, Default)]
 pub struct Recording {
     spans: Arc<Mutex<Spans>>,
-    /// Waited for where a span begins or ends.
+    /// Device to wait for at the start and end of spans.
     device: Option<Device>,
 }
 
@@ -44,17 +44,16 @@ struct Open {
 }
 
 impl Recording {
-    /// Records the spans of `work` on this thread; those that other threads enter are part of the
-    /// one that waits for them here.
+    /// Records the spans of `work` on this thread. Spans on other threads count towards the span
+    /// that waits for them.
     pub fn of<R>(work: impl FnOnce(&Self) -> R) -> R {
         let recording = Self::default();
         let subscriber = Registry::default().with(recording.clone());
         with_default(subscriber, || work(&recording))
     }
 
-    /// The same, where `work` is done by a device that goes on while the host does: each span
-    /// begins and ends when the device has nothing left to do. What else runs side by side is lost
-    /// to the whole.
+    /// [`of`](Self::of) for a device that works asynchronously: each span begins and ends with an
+    /// idle device, so the total loses any overlap.
     pub fn on_device<R>(device: &Device, work: impl FnOnce(&Self) -> R) -> R {
         let recording = Self {
             device: Some(device.clone()),
@@ -64,16 +63,16 @@ impl Recording {
         with_default(subscriber, || work(&recording))
     }
 
-    /// The most bytes in use where a span began or ended, by the device's own count; zero without a
-    /// device that counts.
+    /// Peak bytes in use at the start or end of a span, by the device's own count; zero without a
+    /// counting device.
     pub fn most_in_use(&self) -> u64 {
         self.spans().most_in_use
     }
 
-    /// Until the device has done what it was given.
+    /// Waits until the device is idle.
     fn settle(&self) {
         let Some(device) = &self.device else { return };
-        // A device that fails says so again to whoever asks it for a result.
+        // A failed device reports its error again to whoever requests a result.
         let _ = device.sync();
         if let Some(usage) = device.memory_pool_usage() {
             let mut spans = self.spans();
@@ -81,7 +80,7 @@ impl Recording {
         }
     }
 
-    /// What was recorded; begins anew.
+    /// Returns the recorded stages and starts anew.
     pub fn take(&self) -> Vec<Stage> {
         core::mem::take(&mut self.spans().stages)
     }

@@ -1,4 +1,4 @@
-//! A training step on the CPU: its time, on one thread and on all, and what the time goes to.
+//! A training step on the CPU: its time on one thread and on all, by stage.
 
 use std::fmt::Write;
 use std::sync::Arc;
@@ -18,21 +18,19 @@ use splat_data::Capture;
 use splat_data::View;
 use splat_trainer::{TrainSettings, Trainer};
 
-/// Steps before the clock starts: caches and the allocator fill, spherical harmonics reach their
-/// degree.
+/// Unmeasured steps: caches and the allocator fill, and spherical harmonics reach their degree.
 const WARM_UP: usize = 5;
-/// Steps measured of one run. Fewer than until density control first changes the number of
-/// Gaussians.
+/// Measured steps per run; fewer than it takes density control to change the number of Gaussians.
 const STEPS: usize = 20;
-/// Steps measured of one setting, over its runs, unless time is up.
+/// Measured steps per setting, over its runs, unless time is up.
 const MOST_STEPS: usize = 200;
 /// Views whose work is counted.
 const VIEWS: usize = 16;
 
-/// The training step of a capture's first Gaussians.
+/// The training step of a capture's initial Gaussians.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct StepReport {
-    /// Where and when.
+    /// Machine and date.
     pub machine: Machine,
     /// Name of the capture.
     pub capture: String,
@@ -40,13 +38,13 @@ pub struct StepReport {
     pub work: Work,
     /// One per degree of spherical harmonics and number of threads.
     pub rows: Vec<StepRow>,
-    /// Most memory that was resident while all this was measured.
+    /// Peak resident memory during the measurement.
     pub peak_rss_bytes: Option<u64>,
 }
 
-/// Measures steps of `capture` at degree 0, with which training begins, and 3, with which it ends;
-/// on one thread and on all. `seconds` bounds the time spent on each of these settings, as far as a
-/// run of 20 steps does; `say` hears of each.
+/// Measures steps of `capture` at degree 0, where training begins, and 3, where it ends, on one
+/// thread and on all. `seconds` limits the time of each setting, beyond a run of 20 steps; `say`
+/// receives progress messages.
 ///
 /// # Errors
 /// When the capture cannot be trained on.
@@ -65,7 +63,7 @@ pub fn measure(
         let config = at_degree(config, sh_degree);
         let mut samples: Vec<Samples> = threads.iter().map(|_| Samples::default()).collect();
         let start = Instant::now();
-        // Turn by turn, so that whatever else the machine does is in all of them alike.
+        // The settings alternate, so that other load on the machine affects them alike.
         while samples[0].steps.len() < MOST_STEPS {
             for (threads, samples) in threads.iter().zip(&mut samples) {
                 let run = on_threads(*threads, || run(capture, &config, WARM_UP, STEPS))?;
@@ -89,8 +87,8 @@ pub fn measure(
     })
 }
 
-/// A run of the usual length that evaluates spherical harmonics of degree 0, or of 3 from the
-/// fourth step on.
+/// Settings of a run of the usual length that evaluates spherical harmonics of degree 0, or of
+/// degree 3 from the fourth step.
 pub(super) fn at_degree(config: &TrainSettings, sh_degree: usize) -> TrainSettings {
     let usual = TrainSettings::default();
     TrainSettings {
@@ -100,7 +98,7 @@ pub(super) fn at_degree(config: &TrainSettings, sh_degree: usize) -> TrainSettin
     }
 }
 
-/// The work of the first Gaussians of a capture on the CPU.
+/// Work of a capture's initial Gaussians on the CPU.
 pub(super) fn work(
     capture: &Arc<Capture>,
     config: &TrainSettings,
@@ -108,7 +106,7 @@ pub(super) fn work(
     work_on(capture, config, &Device::flex())
 }
 
-/// The work of the first Gaussians of a capture, as the ops of `device` do it.
+/// Work of a capture's initial Gaussians, counted by the ops of `device`.
 pub(super) fn work_on(
     capture: &Arc<Capture>,
     config: &TrainSettings,
@@ -132,12 +130,12 @@ pub(super) fn trainer(
         .build()?)
 }
 
-/// What was measured of some steps.
+/// Measurements of some steps.
 #[derive(Default)]
 pub(super) struct Samples {
-    /// Seconds, and stages, of each.
+    /// Seconds and stages of each step.
     pub(super) steps: Vec<(f64, Vec<Stage>)>,
-    /// Over all of them.
+    /// Resource use of all of them.
     usage: Vec<Usage>,
 }
 
@@ -173,8 +171,8 @@ impl Samples {
         }
     }
 
-    /// Median time of each stage in milliseconds, in the order in which they end; last what no
-    /// stage covers.
+    /// Median time of each stage in milliseconds, in the order of completion, and finally the time
+    /// outside all stages.
     pub(super) fn stages(&self) -> Vec<(String, f64)> {
         let mut names: Vec<&str> = vec![];
         for stage in self.steps.iter().flat_map(|(_, stages)| stages) {
@@ -195,7 +193,7 @@ impl Samples {
     }
 }
 
-/// What is left to a span of the trainer when the ops inside have taken theirs.
+/// Label of a trainer span, for its time outside the ops.
 fn label(span: &str) -> String {
     match span {
         "step" => "rest (Burn and the trainer)".to_owned(),
@@ -204,7 +202,7 @@ fn label(span: &str) -> String {
     }
 }
 
-/// Takes `warm_up` steps and then measures up to `steps` more.
+/// Takes `warm_up` steps, then measures up to `steps` more.
 pub(super) fn run(
     capture: &Arc<Capture>,
     config: &TrainSettings,
@@ -232,8 +230,8 @@ pub(super) fn run(
 }
 
 impl StepReport {
-    /// How many times faster all threads are than one, by degree of spherical harmonics: (degree,
-    /// threads, ratio).
+    /// Speed-up of all threads over one, by degree of spherical harmonics: (degree, threads,
+    /// ratio).
     pub fn speed_ups(&self) -> Vec<(usize, usize, f64)> {
         let one = |degree| {
             let mut rows = self.rows.iter();
@@ -247,7 +245,7 @@ impl StepReport {
         .collect()
     }
 
-    /// The tables.
+    /// The result as tables.
     pub fn markdown(&self) -> String {
         let mut text = String::new();
         // Writing into a string cannot fail.
@@ -302,7 +300,7 @@ impl StepReport {
     }
 }
 
-/// The stages of a step at one setting.
+/// Stages of a step at one setting.
 pub(super) struct StageColumn<'a> {
     pub(super) head: String,
     pub(super) stages: &'a [(String, f64)],

@@ -1,4 +1,4 @@
-//! What was measured of steps at one setting.
+//! Measurements of steps at one setting.
 
 use serde::Serialize;
 
@@ -15,10 +15,11 @@ pub struct StepRow {
     pub steps: usize,
     /// Time of a step.
     pub milliseconds: Spread,
-    /// Median time of each stage, in the order in which they end; last what no stage covers.
+    /// Median time of each stage, in the order of completion, and finally the time outside all
+    /// stages.
     pub stages: Vec<(String, f64)>,
-    /// Processor time of all threads per step; on an idle machine, that of the step times the
-    /// threads, as far as these have work. Absent where the system does not say.
+    /// Processor time of all threads per step; on an idle machine, the time of the step times the
+    /// number of busy threads. Absent if the system does not report it.
     pub cpu_milliseconds: Option<f64>,
     /// Pages of fresh memory per step.
     pub page_faults: Option<f64>,

@@ -1,4 +1,4 @@
-//! How much there is to do in a view.
+//! Amount of work in a view.
 
 use burn::tensor::{Device, Tensor};
 use serde::{Deserialize, Serialize};
@@ -8,7 +8,7 @@ use splat_ops::rasterize_work;
 use super::PerformanceError;
 use splat_data::View;
 
-/// Counts, each the mean over the views.
+/// Counts, averaged over views.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Work {
     /// Views counted.
@@ -21,12 +21,12 @@ pub struct Work {
     pub intersections: f64,
     /// Pixels of a view.
     pub pixels: f64,
-    /// (pixel, Gaussian) pairs that the inner loop evaluates.
+    /// (pixel, Gaussian) pairs evaluated by the inner loop.
     pub tested: f64,
-    /// Those past the alpha cut; as [`RasterizeWork`](splat_ops::RasterizeWork) has it, beyond the
-    /// image's edges too.
+    /// Pairs past the alpha cut, including those beyond the image's edges, as in
+    /// [`RasterizeWork`](splat_ops::RasterizeWork).
     pub seen: f64,
-    /// Those blended.
+    /// Pairs blended.
     pub blended: f64,
 }
 
@@ -44,7 +44,7 @@ impl Work {
             ..Self::default()
         };
         let share = 1.0 / views.len().max(1) as f64;
-        // Counts depend on colours only where these are not finite.
+        // Counts depend on colours only if those are not finite.
         let colors = Tensor::<3>::zeros([1, gaussians.len(), 1], device);
         for view in views {
             let cameras =
@@ -68,7 +68,7 @@ impl Work {
         Ok(work)
     }
 
-    /// As a Markdown table.
+    /// The counts as a Markdown table.
     pub fn markdown(&self) -> String {
         let per_pixel = |count: f64| format!("{:.1}", count / self.pixels.max(1.0));
         format!(
@@ -172,12 +172,12 @@ mod tests {
         ]
         .map(|data| data.try_into_vec::<f32>().unwrap());
         let [seen, blended] = by_hand(projected, opacities, [view.width, view.height]);
-        // A pair may be on the other side of a threshold in single precision.
+        // In single precision a pair may lie on the other side of a threshold.
         let close = |count: f64, exact: f64| {
             assert!((count - exact).abs() <= 1e-4 * exact, "{count} {exact}");
         };
         close(work.blended, blended);
-        // Those behind the place where a pixel stops need not be looked at.
+        // Pairs behind the stop of a pixel need not be evaluated.
         assert!(work.seen >= work.blended && work.seen <= seen * (1.0 + 1e-4));
         assert!(blended < 0.9 * seen, "{blended} {seen}: no pixel stops");
         assert!(work.tested >= work.seen);

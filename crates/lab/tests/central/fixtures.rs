@@ -1,4 +1,4 @@
-//! Files of `scripts/fixtures.py`: a difference in any of their tensors is found.
+//! Fixtures of `scripts/fixtures.py`: a difference in any of their tensors is found.
 
 use burn::tensor::{Tensor, activation};
 use splat_lab::central::{Kind, NamedTensors, check_against_fixture};
@@ -70,7 +70,7 @@ fn another_shape_is_an_error() {
     );
 }
 
-/// A file by hand: its header, then its numbers.
+/// A file from its header and numbers.
 fn file(header: &str, values: &[f64]) -> tempfile::NamedTempFile {
     use std::io::Write;
     let mut file = tempfile::NamedTempFile::new().unwrap();

@@ -1,12 +1,12 @@
-//! The gradient check of any function: what it finds, what it passes, and what PyTorch says of the
+//! The gradient check of any function: what it finds, what it passes, and PyTorch's verdict on the
 //! same functions.
 //!
-//! - `ten`: ten functions beside `torch.autograd.gradcheck`.
+//! - `ten`: ten functions, compared with `torch.autograd.gradcheck`.
 //! - `planted`: bugs of every kind, found and named.
-//! - `million`: large inputs, and the smallest error that is seen in them.
-//! - `right`: functions with right gradients pass, our own ops among them.
-//! - `fixtures`: files of `scripts/fixtures.py`.
-//! - `refused`: what cannot be checked, and the message.
+//! - `million`: large inputs, and the smallest error seen in them.
+//! - `right`: functions with correct gradients pass, including our own ops.
+//! - `fixtures`: fixtures of `scripts/fixtures.py`.
+//! - `refused`: functions that cannot be checked, and the messages.
 #![cfg(feature = "cpu")]
 
 mod fixtures;
@@ -19,7 +19,7 @@ mod ten;
 use burn::tensor::Tensor;
 use splat_lab::central::{Finding, Kind, Report, tensor};
 
-/// Numbers from -1 to 1 that no formula of a test knows.
+/// Arbitrary numbers from -1 to 1.
 pub fn numbers(seed: u64, count: usize) -> Vec<f64> {
     let mut state = seed.wrapping_mul(2).wrapping_add(1);
     let mut next = || {
@@ -31,7 +31,7 @@ pub fn numbers(seed: u64, count: usize) -> Vec<f64> {
     (0..count + 4).map(|_| next()).skip(4).collect()
 }
 
-/// A tensor of them.
+/// A tensor of arbitrary numbers.
 pub fn random<const D: usize>(seed: u64, shape: [usize; D]) -> Tensor<D> {
     tensor(numbers(seed, shape.iter().product()), shape)
 }

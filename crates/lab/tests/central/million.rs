@@ -21,7 +21,7 @@ fn mask(at: usize, error: f64) -> Tensor<1> {
     tensor(mask, [MILLION])
 }
 
-/// The value of `y`, and its gradient times 1 + mask.
+/// The value of `y`, with its gradient times 1 + mask.
 fn spoilt<const D: usize>(y: Tensor<D>, mask: Tensor<D>) -> Tensor<D> {
     y.clone() + mask * (y.clone() - y.detach())
 }
@@ -63,8 +63,8 @@ fn one_wrong_element_is_found_wherever_it_is() {
     }
 }
 
-/// The limit that the report states: an element beyond it is found, and far below it is not. With
-/// `--nocapture` the numbers of docs/GRADCHECK.md.
+/// The limit stated in the report holds: an element beyond it is found, and one far below it is
+/// not. With `--nocapture`, prints the numbers of docs/GRADCHECK.md.
 #[test]
 fn the_limit_is_where_the_report_says() {
     let x = input();
@@ -91,7 +91,7 @@ fn the_limit_is_where_the_report_says() {
     );
 }
 
-/// With a tolerance for nothing but rounding, smaller ones are seen.
+/// With a tolerance at rounding level, smaller errors are seen.
 #[test]
 fn a_smaller_tolerance_sees_more() {
     let mask = mask(WRONG_AT, 1e-6);
@@ -104,7 +104,7 @@ fn a_smaller_tolerance_sees_more() {
     report.expect();
 }
 
-/// Two errors that cancel in a sum are still two.
+/// Two errors that cancel in a sum are still found.
 #[test]
 fn two_wrong_elements_are_both_found() {
     let mut errors = vec![0.0; MILLION];
@@ -119,8 +119,8 @@ fn two_wrong_elements_are_both_found() {
     assert_eq!(found, [Some(vec![77]), Some(vec![888_888])], "{report}");
 }
 
-/// Functions that mix all elements, and outputs of one element: nothing about the search needs a
-/// function by elements.
+/// Functions that mix all elements, and outputs of one element: the search needs no elementwise
+/// function.
 #[test]
 fn functions_that_mix_elements() {
     let x = || ("x", random(5, [1000, 1000]));
@@ -144,7 +144,7 @@ fn functions_that_mix_elements() {
     }
 }
 
-/// Thousands of elements have their kink within the largest step; one has it at the point, one is
+/// Thousands of elements have a kink within the largest step; one has it at the point, and one is
 /// wrong.
 #[test]
 fn kinks_all_over() {

@@ -1,11 +1,11 @@
-//! Bugs of every kind, found and named with their input and element.
+//! Bugs of every kind are found, with their input and element.
 
 use burn::tensor::activation;
 use splat_lab::central::{Kind, Settings, gradcheck, gradcheck_with, tensor};
 
 use super::{assert_wrong, numbers, only, random};
 
-/// Of one element out of twelve, to one part in 100,000.
+/// One element of twelve is wrong by one part in 100,000.
 #[test]
 fn a_wrong_factor_at_one_element() {
     let mut mask = vec![0.0; 12];
@@ -45,7 +45,7 @@ fn a_wrong_sign() {
     );
 }
 
-/// The gradient reaches the input by one way of two.
+/// The gradient reaches the input by only one of two paths.
 #[test]
 fn a_missing_term() {
     let report = gradcheck(
@@ -57,7 +57,7 @@ fn a_missing_term() {
     assert!(report.row("w").unwrap().is_ok(), "{report}");
 }
 
-/// Values and gradients are those of another permutation of the input.
+/// Values and gradients belong to different permutations of the input.
 #[test]
 fn a_gradient_in_the_wrong_place() {
     let report = gradcheck(
@@ -89,7 +89,7 @@ fn a_detached_input() {
     );
 }
 
-/// Behind a dead ReLU nothing tells a detached input from another. The report says that all is
+/// Behind a dead ReLU a detached input looks like any other. The report says that everything is
 /// zero.
 #[test]
 fn an_input_without_influence_is_named() {
@@ -141,7 +141,7 @@ fn a_kink_is_named_with_both_slopes() {
     assert!(report.check().unwrap_err().to_string().contains("a kink"));
 }
 
-/// At the kink a gradient outside of both slopes is wrong.
+/// At a kink, a gradient outside both slopes is wrong.
 #[test]
 fn a_wrong_gradient_at_a_kink() {
     let report = gradcheck(
@@ -165,7 +165,7 @@ fn a_wrong_gradient_at_a_kink() {
     assert!(!report.is_ok());
 }
 
-/// A kink one part in a million beside the point is none of it.
+/// A kink one part in a million from the point does not count.
 #[test]
 fn a_kink_beside_the_point_is_not_named() {
     let x = tensor([1e-6, -1e-5, 0.3, 0.8], [4]);
@@ -174,7 +174,7 @@ fn a_kink_beside_the_point_is_not_named() {
     assert!(report.rows[0].findings.is_empty(), "{report}");
 }
 
-/// A maximum between two inputs that are equal, a kink in both.
+/// A maximum of two equal inputs: a kink in both.
 #[test]
 fn a_kink_between_inputs() {
     let report = gradcheck(
@@ -192,7 +192,7 @@ fn a_kink_between_inputs() {
     }
 }
 
-/// The sign function at zero has no derivative that differences could tell.
+/// The sign function has no derivative at zero that differences could determine.
 #[test]
 fn a_jump_is_not_passed() {
     let report = gradcheck(
@@ -205,7 +205,7 @@ fn a_jump_is_not_passed() {
     assert_eq!(finding.comparison.at, Some(vec![1]), "{report}");
 }
 
-/// A bug in a gradient that is small beside that of another input.
+/// A bug in a gradient that is small compared with another input's.
 #[test]
 fn small_gradients_have_their_own_scale() {
     let report = gradcheck(
@@ -217,7 +217,7 @@ fn small_gradients_have_their_own_scale() {
     assert!(!report.row("y").unwrap().is_ok(), "{report}");
 }
 
-/// Of several outputs each counts.
+/// Each of several outputs counts.
 #[test]
 fn a_bug_in_the_second_output() {
     let report = gradcheck(
@@ -228,8 +228,8 @@ fn a_bug_in_the_second_output() {
     assert!(!report.is_ok(), "{report}");
 }
 
-/// In a large input kinks are looked for one after the other. Ten are too many, and what they may
-/// hide is not passed.
+/// In a large input kinks are searched one by one. Ten are too many, and whatever they may hide
+/// does not pass.
 #[test]
 fn too_many_kinks_in_a_large_input() {
     let mut values = numbers(12, 2000);

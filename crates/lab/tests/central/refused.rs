@@ -1,4 +1,4 @@
-//! What cannot be checked, and the message that says so.
+//! Functions that cannot be checked, and the messages.
 
 use std::cell::Cell;
 
@@ -35,7 +35,7 @@ fn a_gradient_that_is_not_finite() {
     );
 }
 
-/// Finite at the point, with a finite gradient, and at no step beside it.
+/// Finite at the point, with a finite gradient, but at no step from it.
 #[test]
 fn a_point_at_the_edge_of_the_domain() {
     let zero = ("x", tensor([0.0, 4.0], [2]));
@@ -118,7 +118,7 @@ fn a_constant_is_not_differentiated() {
     assert!(report.to_string().contains("constant"), "{report}");
 }
 
-/// Inputs come in any float type; the check computes in double precision.
+/// Inputs may have any float type; the check computes in double precision.
 #[test]
 fn inputs_in_single_precision() {
     let single = x().1.cast(DType::F32);

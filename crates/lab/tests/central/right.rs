@@ -1,4 +1,4 @@
-//! Functions with right gradients pass, our own ops among them.
+//! Functions with correct gradients pass, including our own ops.
 
 use burn::tensor::{Tensor, activation};
 use splat_lab::central::{Kind, Report, Settings, gradcheck, gradcheck_with, tensor};
@@ -9,7 +9,7 @@ use splat_ops::{
 
 use super::{numbers, random};
 
-/// No findings, kinks included, and derivatives to eight digits.
+/// Asserts that there are no findings, kinks included, and derivatives to eight digits.
 fn assert_clean(name: &str, report: &Report) {
     println!("{name}\n{report}");
     report.expect();
@@ -64,7 +64,7 @@ fn elements_of_very_different_size() {
     assert_clean("log", &report);
 }
 
-/// Rounding inside of the function, a million times that of its output, is no wrong gradient.
+/// Rounding inside the function, a million times that of its output, is not a wrong gradient.
 #[test]
 fn noise_is_noticed() {
     let report = gradcheck(|x| (x.sin() + 1e6) - 1e6, ("x", random(22, [40]))).unwrap();
@@ -91,7 +91,7 @@ fn many_seeds() {
     }
 }
 
-/// Inputs of all sizes, some of them where most of the gradient vanishes and only rounding is left.
+/// Inputs of all sizes, some of which leave a vanishing gradient and only rounding.
 #[test]
 fn no_false_alarms() {
     let functions: [(&str, &dyn Fn(Tensor<2>) -> Tensor<2>); 7] = [
@@ -150,7 +150,7 @@ fn scene() -> (Tensor<2>, Tensor<2>, Tensor<2>, Tensor<3>, Tensor<2>) {
     )
 }
 
-/// The differentiable columns of the screen splats, and the others.
+/// Differentiable columns of the screen splats, and the others.
 fn columns(packed: Tensor<3>) -> (Tensor<3>, Tensor<3>) {
     let cut = |start, length| packed.clone().narrow(2, start, length);
     (
@@ -224,7 +224,7 @@ fn colours() {
     assert_clean("sh_colors", &report);
 }
 
-/// A colour exactly at its clamp is a kink, and the op's gradient that of the right side.
+/// A colour exactly at its clamp is a kink, where the op's gradient is the slope on the right.
 #[test]
 fn a_colour_at_its_clamp_is_a_kink() {
     const SH0: f64 = 0.28209479177387814;

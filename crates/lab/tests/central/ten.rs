@@ -1,5 +1,5 @@
-//! Ten functions, five of them with a planted bug, beside PyTorch: `generate.py` wrote what it says
-//! of them.
+//! Ten functions, five of them with a planted bug, compared with PyTorch's verdicts, which
+//! `generate.py` wrote.
 
 use std::path::Path;
 
@@ -11,7 +11,7 @@ use super::million;
 
 type Twin = fn(&NamedTensors) -> Tensor<2>;
 
-/// All but the one with a million elements.
+/// All except the one with a million elements.
 const NINE: [(&str, Twin); 9] = [
     ("matmul", |at| at.get::<2>("a").matmul(at.get("b"))),
     ("softmax", |at| activation::softmax(at.get::<2>("x"), 1)),
@@ -58,7 +58,7 @@ pub fn verdicts() -> Value {
     serde_json::from_str(&text).unwrap()
 }
 
-/// Our verdict in a word, and the kind of the findings.
+/// Our verdict in one word, and the kinds of findings.
 fn verdict(report: &Report) -> (&'static str, Vec<Kind>) {
     let kinds = report.rows.iter().flat_map(|row| &row.findings);
     let kinds: Vec<_> = kinds.map(|finding| finding.kind).collect();
@@ -72,7 +72,7 @@ fn verdict(report: &Report) -> (&'static str, Vec<Kind>) {
     (word, kinds)
 }
 
-/// With `--nocapture` the rows of the table in docs/GRADCHECK.md.
+/// With `--nocapture`, prints the rows of the table in docs/GRADCHECK.md.
 #[test]
 fn verdicts_beside_pytorch() {
     let theirs = verdicts();
@@ -112,7 +112,7 @@ fn verdicts_beside_pytorch() {
             kinds.windows(2).all(|two| same_kind(two[0], two[1])),
             "{report}"
         );
-        // Where we differ: its fast mode does not see the one element, and it takes the kink for a
+        // The differences: PyTorch's fast mode misses the one element, and takes the kink for a
         // wrong gradient.
         let differ = matches!(*name, "one_in_a_million" | "kink");
         assert_eq!(passes == report.is_ok(), !differ, "{report}");
@@ -123,14 +123,15 @@ fn same_kind(a: Kind, b: Kind) -> bool {
     std::mem::discriminant(&a) == std::mem::discriminant(&b)
 }
 
-/// The gradients of all ten, those of the bugs too, are PyTorch's: both check the same function.
+/// All ten gradients, including those of the bugs, equal PyTorch's, so both check the same
+/// function.
 #[test]
 fn gradients_are_those_of_pytorch() {
     for (name, function) in NINE {
         let report = fixture(name).check(function).unwrap();
         let wrong: Vec<_> = report.rows.iter().filter(|row| !row.is_ok()).collect();
         match name {
-            // PyTorch's zeros of a detached input are "no gradient" here, and equal.
+            // PyTorch's zeros for a detached input are "no gradient" here, and equal.
             "detached_input" | "kink" => assert!(report.worst_relative() <= 1e-12, "{report}"),
             _ => assert!(wrong.is_empty(), "{report}"),
         }

@@ -1,4 +1,4 @@
-//! Cases of blending: transmittance, the cap, the cut, the stop, and the order of splats.
+//! Cases of blending: transmittance, cap, cut, stop, and the order of splats.
 
 use burn::tensor::{Device, Tensor, TensorData};
 use splat_ops::{ProjectSettings, RasterizeSettings, project, rasterize};
@@ -128,7 +128,7 @@ fn opaque_first() -> Vec<Scene> {
 }
 
 fn cap_above_stop() -> Vec<Scene> {
-    // Two capped splats leave 1e-4, just above the stop; a third would go below it.
+    // Two capped splats leave 1e-4, just above the stop; a third would cross it.
     vec![clear(1e-5, |seed| {
         let mut sketch = Sketch::new("stop after two at the cap", 32, 32, seed);
         for depth in [1.0, 1.5, 2.0] {
@@ -145,7 +145,7 @@ fn on_pixel_centres(name: &'static str, seed: u64, opacities: &[f64]) -> Scene {
     let count = opacities.len();
     for (i, opacity) in opacities.iter().enumerate() {
         let pixel = [4.5 + 24.0 * i as f64 / count as f64, 16.5];
-        // Whole pixels plus a half, depths that are powers of two: exact in every precision.
+        // Integers plus a half, and depths that are powers of two: exact in every precision.
         let pixel = [pixel[0].floor() + 0.5, pixel[1]];
         let axes = [sketch.uniform(1.0, 2.5), sketch.uniform(1.0, 2.5), 1.0];
         let depth = (1.0 + (i % 3) as f64).exp2();
@@ -237,7 +237,7 @@ fn duplicates() -> Scene {
             let quat = sketch.turn();
             sketch.splat(pixel, 2.0, [5.0, 3.0, 4.0], quat, 0.5);
         }
-        // The same places and shapes once more, in other colours.
+        // The same positions and shapes again, in other colours.
         let copies: Vec<_> = sketch.blobs.iter().rev().cloned().collect();
         for mut copy in copies {
             copy.sh = sketch.colors();
@@ -265,7 +265,7 @@ fn depths_an_ulp_apart() -> Vec<Scene> {
     vec![clear(1e-5, |seed| {
         let mut sketch = Sketch::new("depths an ulp apart", 32, 32, seed);
         let ulp = f64::from(1e4f32.next_up()) - 1e4;
-        // Farthest first, so that the order of the list is the wrong one.
+        // Farthest first, so that the list is in reverse order.
         for i in (0..12).rev() {
             let pixel = [sketch.uniform(10.0, 22.0), sketch.uniform(10.0, 22.0)];
             sketch
@@ -304,7 +304,7 @@ fn nothing_visible(device: &Device) -> Result<Outcome, AccuracyError> {
             format!("{}: exactly the background", scene.source.display()),
         );
     }
-    // One splat in a corner of six tiles: the others are empty.
+    // One splat in a corner of six tiles; the others are empty.
     let mut corner = Sketch::new("empty tiles", 48, 32, 3);
     corner.splat([5.0, 5.0], 2.0, [1.5, 1.0, 1.2], about_z(0.2), 0.8);
     Ok(outcome.and(against_double(&corner.scene(), device, &[])?))
@@ -331,8 +331,8 @@ fn all_losses(device: &Device) -> Result<Outcome, AccuracyError> {
         .demand(errors.iter().all(|e| *e <= 1e-3), "19 channels within 1e-3"))
 }
 
-/// Image of 19 feature channels, and the gradients of a quadratic loss on it to features, opacities
-/// and background.
+/// Image of 19 feature channels, and the gradients of a quadratic loss with respect to features,
+/// opacities and background.
 fn features(
     scene: &Scene,
     device: &Device,
@@ -402,9 +402,9 @@ fn million_contributions() -> Vec<Scene> {
 }
 
 fn too_many_pairs(device: &Device) -> Result<Outcome, AccuracyError> {
-    // Every splat covers all 65,536 tiles: 4.3e9 pairs, more than 32 bits count; on a CubeCL
-    // device, whose backward keeps up to 22 values per pair, 2.6e8 are too many (Mesa's software
-    // device, which ends any loop after 65,535 rounds, finds a few fewer).
+    // Every splat covers all 65,536 tiles. The 4.3e9 pairs exceed 32 bits; on a CubeCL device,
+    // whose backward pass keeps up to 22 values per pair, 2.6e8 are too many. (Mesa's software
+    // device, which ends any loop after 65,535 iterations, finds slightly fewer.)
     let side = 4096;
     let n = match *device == Device::flex() {
         true => 65_600,

@@ -1,4 +1,4 @@
-//! Cases of the camera: its centre, near plane, clamp, openings, map-sized coordinates, units.
+//! Cases of the camera: centre, near plane, clamp, openings, map-sized coordinates, units.
 
 use burn::tensor::Device;
 use glam::DVec3;
@@ -79,8 +79,8 @@ fn near_plane() -> Vec<Scene> {
 }
 
 fn at_the_clamp() -> Vec<Scene> {
-    // Margin and focal length are powers of two: x/z = (16 + 4)/32 is exact, and so are its
-    // neighbours.
+    // Margin and focal length are powers of two, so that x/z = (16 + 4)/32 and its neighbours are
+    // exact.
     vec![clear(1e-5, |seed| {
         let mut sketch = Sketch::new("at the clamp", 32, 32, seed);
         sketch.project.clamp_margin = 0.125;
@@ -145,9 +145,9 @@ fn wide() -> Vec<Scene> {
     })]
 }
 
-/// A scene far away, once in double precision at its place in the world, once in single precision
-/// from an origin. The pose gradient of the first is carried to the origin: that of W loses t's
-/// times the origin.
+/// A distant scene, in double precision at its place in the world, and in single precision relative
+/// to an origin. The pose gradient of the first is transferred to the origin: that of W loses the
+/// gradient of t times the origin.
 fn map_coordinates(device: &Device) -> Result<Outcome, AccuracyError> {
     let mut outcome = Outcome::new();
     for offset in [1e5, 1e6, 1e7] {
@@ -157,8 +157,8 @@ fn map_coordinates(device: &Device) -> Result<Outcome, AccuracyError> {
             sketch.scatter(16, (0.3, 0.8));
             sketch.scene()
         });
-        // A rotation that is one to single precision only would turn the origin's distance into an
-        // error of the scene.
+        // A rotation that is orthonormal only to single precision would turn the distance of the
+        // origin into an error of the scene.
         let mut local = local;
         local.inputs.viewmat.values = orthonormal(&local.inputs.viewmat.values);
         let mut world = local.clone();
@@ -189,8 +189,9 @@ fn map_coordinates(device: &Device) -> Result<Outcome, AccuracyError> {
     Ok(outcome.note("1e5, 1e6, 1e7"))
 }
 
-/// Leaves of the gradient [dW | dt] what a rigid motion sees: the skew part of W^T dW, and dt. The
-/// rest would make W no rotation any more; there, the two places of the scene differ by definition.
+/// Restricts the gradient [dW | dt] to rigid motions: the skew part of W^T dW, and dt. The rest
+/// would make W something other than a rotation, for which the two placements of the scene differ
+/// by definition.
 fn pose_gradient(viewmat: &[f64], gradient: &mut Array) {
     let rows = |values: &[f64]| [0, 1, 2].map(|i| DVec3::from_slice(&values[4 * i..4 * i + 3]));
     let (w, dw) = (rows(viewmat), rows(&gradient.values));
@@ -202,7 +203,7 @@ fn pose_gradient(viewmat: &[f64], gradient: &mut Array) {
     }
 }
 
-/// The same pose, its rotation orthonormal in double precision.
+/// The same pose, with its rotation orthonormal in double precision.
 fn orthonormal(viewmat: &[f64]) -> Vec<f64> {
     let axis = |i: usize| DVec3::from_slice(&viewmat[4 * i..4 * i + 3]);
     let x = axis(0).normalize();

@@ -1,4 +1,4 @@
-//! Cases of colour: spherical harmonics, their direction, and photos of eight bits.
+//! Cases of colour: spherical harmonics, their direction, and 8-bit photos.
 
 use std::sync::Arc;
 
@@ -50,14 +50,14 @@ fn directional(name: &'static str, base: (f64, f64), band: f64) -> Scene {
 }
 
 fn crossing_zero() -> Vec<Scene> {
-    // The colour is 0.5 + 0.28 sh0 + ...: about zero, half of them below it.
+    // The colour is 0.5 + 0.28 sh0 + ...: around zero, half of the values below it.
     vec![directional("colour crosses zero", (-2.8, -0.8), 0.5)]
 }
 
 fn direction(device: &Device) -> Result<Outcome, AccuracyError> {
     let scene = directional("direction", (0.0, 1.5), 0.4);
     let outcome = against_double(&scene, device, &[])?;
-    // What is lost without it: more than the gate, so that a missing gradient would fail.
+    // The loss without this gradient exceeds the gate, so a missing gradient would fail.
     let without = run(
         &scene,
         &Device::flex(),

@@ -8,7 +8,7 @@ mod shape;
 
 use super::case::Case;
 
-/// All 38, in the order of their numbers.
+/// All 38 cases, by number.
 pub fn cases() -> Vec<Case> {
     let mut cases: Vec<Case> = [
         blending::CASES.as_slice(),

@@ -1,4 +1,4 @@
-//! Cases beyond one rendered picture: opacity logits, poisoned Gaussians, SSIM, Adam.
+//! Cases beyond a single rendered image: opacity logits, poisoned Gaussians, SSIM, Adam.
 
 use burn::optim::Optimizer;
 use burn::tensor::{DType, Device, Tensor, TensorData};
@@ -67,7 +67,7 @@ fn opacity_logits(device: &Device) -> Result<Outcome, AccuracyError> {
             );
         }
         let mut scene = sketch.scene();
-        // Not rounded: 1 - o of a logit of 30 is far below an ulp of one.
+        // Not rounded: at a logit of 30, 1 - o is far below an ulp of one.
         scene.inputs.opacities.values = wide.map(|x| 1.0 / (1.0 + (-x).exp())).to_vec();
         scene
     };
@@ -94,8 +94,8 @@ fn opacity_logits(device: &Device) -> Result<Outcome, AccuracyError> {
     let loss = weigh(rendered.image(), &upstream.image) + weigh(rendered.alpha(), &upstream.alpha);
     let gradient = gaussians.opacity_logits.val().grad(&loss.backward());
     let gradient = read(gradient.ok_or_else(|| AccuracyError::Read("no gradient".into()))?)?;
-    // Of every logit for itself: the extreme ones would drown in the others' norm. Those below the
-    // smallest normal float can only be about zero.
+    // Judged per logit, as the extreme ones would vanish in the norm of the others. Values below
+    // the smallest normal float can only be approximately zero.
     let error = |i: usize| match expected[i].abs() < f64::from(f32::MIN_POSITIVE) {
         true => gradient[i].abs().min(1.0),
         false => relative_l2(&gradient[i..=i], &expected[i..=i]),
@@ -114,7 +114,7 @@ fn opacity_logits(device: &Device) -> Result<Outcome, AccuracyError> {
     ))
 }
 
-/// The scene as a model with these logits, rendered.
+/// Renders the scene as a model with these logits.
 fn rendered_model(
     scene: &Scene,
     logits: &[f32],
@@ -154,7 +154,7 @@ fn rendered_model(
     Ok((gaussians, rendered))
 }
 
-/// Everything but the rows of Gaussian `n`.
+/// Everything except the rows of Gaussian `n`.
 fn others(computed: &Computed, n: usize) -> Vec<f64> {
     let g = &computed.gradients;
     let mut values = computed.outputs.image.values.clone();
@@ -204,7 +204,7 @@ fn poisoned(device: &Device) -> Result<Outcome, AccuracyError> {
             };
             array.values[width * VICTIM + width.min(3) / 2] = poison;
             let found = others(&single(&scene, device)?, VICTIM);
-            // A colour of minus infinity is clamped to black, and that is what is seen.
+            // A colour of minus infinity is clamped to black, which is visible.
             let holds = match (field, poison == f64::NEG_INFINITY) {
                 ("sh_coeffs", true) => found.iter().all(|value| value.is_finite()),
                 _ => found == expected,
@@ -250,8 +250,8 @@ fn ssim_patches(device: &Device) -> Result<Outcome, AccuracyError> {
         let [loss, gradient] = measure([image, target], device, DType::F32)?;
         let [exact_loss, exact] = measure([image, target], &Device::flex(), DType::F64)?;
         outcome.forward = outcome.forward.max(relative_l2(&loss, &exact_loss));
-        // At its maximum SSIM has no gradient; what is left is measured against that of a visible
-        // difference.
+        // At its maximum SSIM has no gradient; the remainder is compared with the gradient of a
+        // visible difference.
         let largest = exact.iter().fold(0.0f64, |m, g| m.max(g.abs()));
         if largest > 1e-12 {
             outcome.gradient = outcome.gradient.max(relative_l2(&gradient, &exact));

@@ -1,4 +1,4 @@
-//! Cases of a Gaussian's shape: needles, pancakes, extreme scales, quaternions.
+//! Cases of shape: needles, pancakes, extreme scales, quaternions.
 
 use burn::tensor::Device;
 
@@ -83,7 +83,7 @@ fn needles(long: f64, short: f64) -> Vec<Scene> {
             let axes = [long, short, short];
             sketch.splat(pixel, 2.0 + i as f64, axes, about_z(angle), 0.8);
         }
-        // And one in a random direction through space.
+        // And one in a random direction in space.
         let quat = sketch.turn();
         sketch.splat([32.0, 32.0], 6.0, [short, long, short], quat, 0.7);
         sketch.scene()
@@ -94,7 +94,7 @@ fn pancake() -> Vec<Scene> {
     vec![clear(1e-4, |seed| {
         let mut sketch = Sketch::new("pancakes edge-on", 64, 64, seed);
         for i in 0..3 {
-            // Thin along the camera's x, so that one looks along the disc; then turned about the
+            // Thin along the camera's x, so that one looks along the disc; then rotated about the
             // camera's axis.
             let pixel = [32.0 + 2.0 * f64::from(i), 32.0];
             let blob = sketch.splat(pixel, 2.0, [1.0; 3], about_z(0.3 * f64::from(i)), 0.9);
@@ -121,7 +121,7 @@ fn sub_pixel() -> Vec<Scene> {
                 0.95,
             );
         }
-        // Far below a pixel: nothing is seen of them, and nothing of theirs may be infinite.
+        // Far below a pixel: invisible, but nothing may be infinite.
         for size in [1e-3, 1e-6, 1e-10, 1e-15] {
             let pixel = [sketch.uniform(2.0, 22.0), sketch.uniform(2.0, 22.0)];
             sketch.splat(pixel, 5.0, [size; 3], about_z(0.1), 0.95);
@@ -140,7 +140,7 @@ fn extreme_scales() -> Vec<Scene> {
             let blob = sketch.splat(pixel, 3.1 + i as f64, [1.0; 3], quat, 0.4);
             blob.scale = [log_scale.exp(); 3];
         }
-        // Huge along one axis only.
+        // Huge along one axis.
         let quat = sketch.turn();
         let blob = sketch.splat([16.0, 16.0], 7.0, [2.0; 3], quat, 0.4);
         blob.scale[1] = 20f64.exp();
@@ -178,7 +178,7 @@ fn quaternion_multiples(device: &Device) -> Result<Outcome, AccuracyError> {
             let mut sketch = Sketch::new("q, -q, 5q", 32, 32, seed).tilted();
             sketch.scatter(12, (0.3, 0.8));
             for blob in &mut sketch.blobs {
-                // To single precision first, so that all multiples are of one quaternion.
+                // Rounded to single precision first, so that all are multiples of one quaternion.
                 blob.quat = blob.quat.map(|x| super::super::sketch::rounded(x) * factor);
             }
             sketch.scene()
@@ -233,8 +233,8 @@ fn needle_outside() -> Vec<Scene> {
 }
 
 fn relocation(_: &Device) -> Result<Outcome, AccuracyError> {
-    // 51 copies of an opaque Gaussian, from the series of the paper in decimal arithmetic of 90
-    // digits.
+    // 51 copies of an opaque Gaussian; the reference is the paper's series in 90-digit decimal
+    // arithmetic.
     let (opacity, factor) = splat_model::strategy::relocate(1.0, 51);
     let error = (factor / 0.420_778_371_403_541_15 - 1.0).abs();
     let finite = [0.0, 1e-300, 0.5, 1.0 - 1e-16, 1.0].iter().all(|o| {

@@ -11,8 +11,8 @@ fn any_vector(rng: &mut Pcg64Mcg, reach: f64) -> DVec3 {
     DVec3::from_array(std::array::from_fn(|_| rng.random_range(-reach..reach)))
 }
 
-/// The integral along a ray, from its definition: the trapezoidal rule, which for a Gaussian that
-/// falls below 1e-31 at both ends is exact to rounding.
+/// The integral along a ray from its definition, by the trapezoidal rule, which is exact to
+/// rounding for a Gaussian that falls below 1e-31 at both ends.
 fn integral(gaussian: &Gaussian3d, origin: DVec3, direction: DVec3) -> f64 {
     let axes = DMat3::from_quat(gaussian.rotation);
     let covariance =
@@ -56,7 +56,7 @@ fn the_closed_form_is_the_integral_along_the_ray() {
             opacity: 1.0,
             color: DVec3::ONE,
         };
-        // Towards somewhere within a standard deviation or two of the mean, in the world.
+        // Towards a point within a standard deviation or two of the mean, in the world.
         let through = (gaussian.mean - camera.position()).normalize();
         let aim = gaussian.rotation * (gaussian.scale * any_vector(&mut rng, 1.5));
         let direction = (gaussian.mean + aim - camera.position()).normalize();
@@ -70,8 +70,8 @@ fn the_closed_form_is_the_integral_along_the_ray() {
     assert!(worst <= 1e-8, "{worst:e}");
 }
 
-/// Without a tilt the error is that of `sin` for `tan`: it falls with the square of the distance.
-/// With one, the side towards the camera is drawn too small and the other too large: linear.
+/// Untilted, the error is that of `sin` for `tan` and falls with the square of the distance.
+/// Tilted, the side towards the camera is drawn too small and the other too large: linear.
 #[test]
 fn the_affine_model_is_right_to_first_order() {
     let device = Device::flex();
@@ -93,8 +93,8 @@ fn the_affine_model_is_right_to_first_order() {
     }
 }
 
-/// Overlapping splats in no order of depth, half of them above the cap of alpha, enough to stop
-/// pixels: as far away as here both models are one, and so must be the blending.
+/// Overlapping splats in random depth order, half of them above the cap of alpha, enough to stop
+/// pixels. At this distance both models agree, so their blending must too.
 #[test]
 fn far_away_scenes_are_blended_alike() {
     const AWAY: f64 = 1e6;
@@ -159,8 +159,8 @@ fn far_away_scenes_are_blended_alike() {
     assert!(image <= 1e-6 && alpha <= 1e-6, "{image:e} {alpha:e}");
 }
 
-/// NUMERICS case 20. A sphere 4 standard deviations away, 45 degrees off the axis of a camera that
-/// sees 120: with every default, the affine picture is off by 28 %, whatever the precision.
+/// A sphere 4 standard deviations away, 45 degrees off the axis of a camera with a 120-degree field
+/// of view: with all defaults, the affine image is off by 28 % in any precision.
 #[test]
 fn a_near_splat_in_a_wide_view_is_off_by_what_is_stated() {
     const SIDE: u32 = 128;

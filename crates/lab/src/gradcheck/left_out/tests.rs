@@ -1,10 +1,10 @@
-//! Fixtures that sit on a threshold where single and double precision decide differently.
+//! Fixtures on a threshold that single and double precision decide differently.
 
 use super::*;
 use crate::accuracy::{Sketch, neighbours};
 use crate::gradcheck::{Scene, gate};
 
-/// What the last splat of a scene brings to a threshold, at [`PIXEL`].
+/// The threshold that the last splat of a scene reaches at [`PIXEL`].
 #[derive(Debug, Clone, Copy)]
 enum On {
     /// Its alpha to `alpha_min`.
@@ -17,7 +17,7 @@ enum On {
 
 const PIXEL: [f64; 2] = [3.5, 4.5];
 
-/// A few splats, and behind two of them at the pixel one whose opacity is yet to be found.
+/// A few splats, and behind two of them at the pixel one whose opacity is found later.
 fn sketch(on: On, side: u32, seed: u64) -> Scene {
     let mut sketch = Sketch::new("threshold", side, side, seed);
     if let On::Stop = on {
@@ -43,7 +43,7 @@ fn double(scene: &Scene) -> crate::gradcheck::Computed {
     run(scene, &Device::flex(), Precision::F64, None).unwrap()
 }
 
-/// The fixture of a scene by our own double precision, and whether single precision fails it with
+/// The fixture of a scene from our own double precision, and whether single precision fails it with
 /// every pixel counted.
 fn judged_whole(scene: Scene) -> (Fixture, bool) {
     let reference = double(&scene);
@@ -59,7 +59,7 @@ fn judged_whole(scene: Scene) -> (Fixture, bool) {
     (fixture, !report.pass)
 }
 
-/// The last splat's alpha at the pixel in double precision, were its opacity 1, and the
+/// Alpha of the last splat at the pixel in double precision, for an opacity of 1, and the
 /// transmittance before it.
 fn at_pixel(scene: &Scene) -> (f64, f64) {
     let computed = double(scene);
@@ -114,7 +114,7 @@ fn checked(fixture: &Fixture, bug: Option<Bug>) -> FileReport {
 }
 
 /// Far from the principal point, where a screen mean is the difference of large numbers, single
-/// precision decides several pixels differently. A splat more or less shows in the picture.
+/// precision decides several pixels differently. An extra or missing splat shows in the image.
 #[test]
 fn every_pixel_that_single_precision_decides_differently_is_near() {
     let (mut flipped, mut near, mut pixels) = (0, 0, 0);
@@ -181,7 +181,7 @@ fn more_than_a_hundredth_of_the_pixels_on_a_threshold_fails() {
     }
 }
 
-/// Leaving pixels out must not excuse anything: the file is judged in double precision with all of
+/// Excluding pixels must not excuse errors: the file is judged in double precision with all of
 /// them.
 #[test]
 fn a_wrong_file_with_a_pixel_on_a_threshold_fails() {

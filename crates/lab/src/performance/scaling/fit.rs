@@ -1,4 +1,4 @@
-//! What the points say: how steep the time grows, and what memory is made of.
+//! Growth of time, and composition of memory, fitted to the points.
 
 use std::fmt;
 
@@ -9,7 +9,7 @@ use super::Point;
 /// Terms of the sum: a constant, Gaussians, intersections, pixels.
 const TERMS: usize = 4;
 
-/// The terms of a point, and its bytes.
+/// Terms of a point, and its bytes.
 type Row = ([f64; TERMS], f64);
 
 /// Gaussians of a point.
@@ -17,13 +17,13 @@ pub fn gaussians(point: &Point) -> f64 {
     point.work.gaussians as f64
 }
 
-/// Pixels of a photo of a point.
+/// Pixels of a photo at a point.
 pub fn pixels(point: &Point) -> f64 {
     point.work.pixels
 }
 
-/// The greatest exponent of step time in `size` between neighbouring points that differ in nothing
-/// else; `None` where no two are such.
+/// Largest exponent of step time in `size` between neighbouring points that differ only in it;
+/// `None` if there are no such points.
 pub fn steepest(points: &[Point], size: fn(&Point) -> f64) -> Option<f64> {
     let same_else = |a: &Point, b: &Point| {
         let same = |of: fn(&Point) -> f64| of(a) == of(b);
@@ -42,11 +42,11 @@ pub fn steepest(points: &[Point], size: fn(&Point) -> f64) -> Option<f64> {
     steepest
 }
 
-/// Peak memory as `constant + a Gaussians + b intersections + c pixels`, by least squares of the
-/// relative error, none of them negative.
+/// Peak memory as `constant + a Gaussians + b intersections + c pixels`, with non-negative terms,
+/// by least squares of the relative error.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
 pub struct MemoryFit {
-    /// Bytes that are always there.
+    /// Constant bytes.
     pub constant: f64,
     /// Bytes per Gaussian.
     pub per_gaussian: f64,
@@ -54,12 +54,12 @@ pub struct MemoryFit {
     pub per_intersection: f64,
     /// Bytes per pixel of a view.
     pub per_pixel: f64,
-    /// Largest relative difference of a point from the sum.
+    /// Largest relative deviation of a point from the sum.
     pub worst: f64,
 }
 
 impl MemoryFit {
-    /// `None` with no more points than terms, with points that do not tell the terms apart, or
+    /// `None` if there are no more points than terms, if the points do not determine the terms, or
     /// without memory figures.
     pub fn of(points: &[Point]) -> Option<Self> {
         let rows: Vec<Row> = points
@@ -69,7 +69,7 @@ impl MemoryFit {
                 Some((terms(point), bytes))
             })
             .collect();
-        // Where all terms at once would have one below zero, the best sum of fewer.
+        // If all terms together would include a negative one, the best sum of fewer terms.
         let fits = (1..1 << TERMS).filter_map(|chosen| {
             let solution = least_squares(&rows, chosen)?;
             let usable = solution.iter().all(|factor| *factor >= 0.0);
@@ -77,7 +77,7 @@ impl MemoryFit {
         });
         let (_, best) = fits.min_by(|a, b| a.0.total_cmp(&b.0))?;
         let [constant, per_gaussian, per_intersection, per_pixel] = best;
-        // The terms can be told apart, and there is something left to check them with.
+        // The terms are determined, and there are further rows to check them.
         (rows.len() > TERMS && least_squares(&rows, (1 << TERMS) - 1).is_some()).then(|| Self {
             constant,
             per_gaussian,
@@ -97,7 +97,7 @@ fn terms(point: &Point) -> [f64; TERMS] {
     ]
 }
 
-/// Relative differences of a sum from what it should be.
+/// Relative deviations of a sum from the measurements.
 fn errors<'a>(rows: &'a [Row], factors: &'a [f64; TERMS]) -> impl Iterator<Item = f64> + 'a {
     rows.iter().map(move |(terms, bytes)| {
         let sum: f64 = terms
@@ -113,11 +113,11 @@ fn squared_error(rows: &[Row], factors: &[f64; TERMS]) -> f64 {
     errors(rows, factors).map(|error| error * error).sum()
 }
 
-/// The factors of the terms whose bits are set in `chosen`, zero for the others; `None` where the
-/// rows do not say.
+/// Factors of the terms whose bits are set in `chosen`, zero for the others; `None` if the rows do
+/// not determine them.
 fn least_squares(rows: &[Row], chosen: usize) -> Option<[f64; TERMS]> {
-    // Normal equations of rows that are divided by their bytes, so that every one asks for 1. Terms
-    // that are left out have the equation `factor = 0`.
+    // Normal equations of rows divided by their bytes, so that each has the right side 1. Excluded
+    // terms have the equation `factor = 0`.
     let mut system = [[0.0; TERMS + 1]; TERMS];
     let is_chosen = |term: usize| chosen & 1 << term != 0;
     for i in 0..TERMS {
@@ -135,8 +135,8 @@ fn least_squares(rows: &[Row], chosen: usize) -> Option<[f64; TERMS]> {
     solve(system)
 }
 
-/// Gauss-Jordan elimination with pivots from the diagonal, which a symmetric positive matrix has;
-/// `None` where it is singular or nearly so.
+/// Gauss-Jordan elimination with diagonal pivots, which suffice for a symmetric positive matrix;
+/// `None` if it is singular or nearly so.
 fn solve(mut system: [[f64; TERMS + 1]; TERMS]) -> Option<[f64; TERMS]> {
     let diagonal: [f64; TERMS] = core::array::from_fn(|i| system[i][i]);
     for k in 0..TERMS {
@@ -213,8 +213,8 @@ mod tests {
         assert_eq!(MemoryFit::of(&points[..4]), None);
         let same = [0; 5].map(|_| points[0].clone());
         assert_eq!(MemoryFit::of(&same), None);
-        // Instances take nothing here, and their count is off: no term may pay for it with bytes
-        // below zero.
+        // Intersections take nothing here, and their count is wrong: no other term may compensate
+        // with negative bytes.
         let off = points.clone().map(|point| {
             let bytes = 5e7 + 900.0 * gaussians(&point) - 9.0 * point.work.intersections;
             Point {
@@ -240,7 +240,7 @@ mod tests {
             point(100, 0.0, 100.0, 5.0),
             point(1000, 0.0, 100.0, 500.0),
             point(10, 0.0, 10_000.0, 10.0),
-            // Nearest to the first, but of another size too.
+            // Nearest to the first, but different in the other size too.
             point(50, 0.0, 10_000.0, 50.0),
         ];
         let exponent = steepest(&points, gaussians).unwrap();

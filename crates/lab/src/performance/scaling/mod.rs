@@ -1,6 +1,6 @@
-//! How step time and memory grow with Gaussians and pixels.
+//! Growth of step time and memory with Gaussians and pixels.
 //!
-//! Every point is measured in a process of its own, so that its peak memory is its own.
+//! Every point is measured in its own process, so that peak memory is its own.
 
 mod fit;
 mod scene;
@@ -25,35 +25,35 @@ use splat_trainer::TrainSettings;
 pub const GAUSSIANS: [usize; 3] = [10_000, 100_000, 1_000_000];
 /// Numbers of pixels.
 pub const PIXELS: [usize; 3] = [100_000, 500_000, 2_000_000];
-/// Steps before the clock starts, of which the fourth is the first at degree 3.
+/// Unmeasured steps, of which the fourth is the first at degree 3.
 const WARM_UP: usize = 4;
-/// Steps measured at a point: the most where Gaussians and pixels together are no more than
-/// `STEP_WORK`, fewer in proportion where they are more.
+/// Measured steps per point: the most if Gaussians and pixels together are at most `STEP_WORK`,
+/// proportionally fewer if they are more.
 const STEPS: core::ops::RangeInclusive<usize> = 3..=20;
 const STEP_WORK: usize = 300_000;
-/// Seconds for each way of measuring the steps of a point on a CubeCL device, as far as three steps
-/// do.
+/// Seconds for each way of measuring a point's steps on a CubeCL device, beyond the first three
+/// steps.
 const DEVICE_SECONDS: f64 = 5.0;
 
 /// All points.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct ScalingReport {
-    /// Where and when.
+    /// Machine and date.
     pub machine: Machine,
-    /// What is known of the CubeCL device; absent where it was the CPU.
+    /// Properties of the CubeCL device; absent for the CPU.
     pub device: Option<Vec<(&'static str, String)>>,
-    /// Points in the order they were measured.
+    /// Points in the order of measurement.
     pub points: Vec<Point>,
-    /// Memory as a sum over what there is; absent where the system does not say, or too few points
+    /// Memory as a sum of terms; absent if the system does not report memory, or too few points
     /// were measured.
     pub memory: Option<MemoryFit>,
 }
 
-/// So many Gaussians and pixels.
+/// A point: a number of Gaussians and of pixels.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Point {
-    /// The work of a view; its counts of Gaussians and pixels are what was asked for, as nearly as
-    /// images go.
+    /// Work per view; its numbers of Gaussians and pixels are the requested ones, as closely as
+    /// images allow.
     pub work: Work,
     /// Threads.
     pub threads: usize,
@@ -61,16 +61,17 @@ pub struct Point {
     pub steps: usize,
     /// Time of a step.
     pub milliseconds: Spread,
-    /// Median time of each stage, in the order in which they end; last what no stage covers.
+    /// Median time of each stage, in the order of completion, and finally the time outside all
+    /// stages.
     pub stages: Vec<(String, f64)>,
-    /// Most memory that was resident.
+    /// Peak resident memory.
     pub peak_rss_bytes: Option<u64>,
-    /// Memory on the CubeCL device; absent where it was the CPU.
+    /// Memory on the CubeCL device; absent for the CPU.
     pub device_memory: Option<DeviceMemory>,
 }
 
 impl Point {
-    /// Peak memory: of the device, if it has its own; else of the process.
+    /// Peak memory of the device, if it has its own; else of the process.
     pub fn memory(&self) -> Option<u64> {
         let device = self.device_memory.map(|memory| memory.most_bytes);
         device.or(self.peak_rss_bytes)
@@ -80,7 +81,7 @@ impl Point {
 /// Measures one point in this process, on `device`.
 ///
 /// # Errors
-/// When a step cannot be taken.
+/// When a step fails.
 pub fn measure_point(
     gaussians: usize,
     size: PhotoSize,
@@ -104,7 +105,7 @@ pub fn measure_point(
     let most = *STEPS.end() * STEP_WORK / (gaussians + size.pixels()).max(1);
     let steps = most.clamp(*STEPS.start(), *STEPS.end());
     let samples = on_threads(threads, || run(&capture, &config, WARM_UP, steps))?;
-    // Before the work is counted, which takes memory too.
+    // Read before the work is counted, which takes memory too.
     let peak_rss_bytes = peak_rss_bytes();
     Ok(Point {
         work: work_on(&capture, &config, device)?,
@@ -118,10 +119,10 @@ pub fn measure_point(
 }
 
 impl ScalingReport {
-    /// Measures all points on `device`, each by `measure`, which gets Gaussians and size.
+    /// Measures all points on `device`, each by `measure`, which receives Gaussians and size.
     ///
     /// # Errors
-    /// That of the first point that has one.
+    /// The error of the first point that fails.
     pub fn of(
         gaussians: &[usize],
         sizes: &[PhotoSize],
@@ -142,7 +143,7 @@ impl ScalingReport {
         })
     }
 
-    /// The tables.
+    /// The result as tables.
     pub fn markdown(&self) -> String {
         let mut text = String::new();
         // Writing into a string cannot fail.

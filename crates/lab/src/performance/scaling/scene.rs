@@ -1,4 +1,4 @@
-//! A capture of any number of points and pixels, the same every time.
+//! A deterministic synthetic capture with any number of points and pixels.
 
 use std::fmt;
 use std::path::PathBuf;
@@ -13,20 +13,20 @@ use splat_data::{Point, Split, View};
 
 /// Views.
 const VIEWS: usize = 4;
-/// Depths of the sheets that the points lie on, in units of the world.
+/// Depths of the sheets of points, in world units.
 const SHEETS: [f64; 4] = [3.0, 4.0, 5.0, 6.0];
-/// Sheets reach this far beyond the view, relative to its size.
+/// Extent of the sheets beyond the view, relative to its size.
 const MARGIN: f64 = 1.1;
 /// Distance of the cameras from their middle along each axis.
 const STEP: f64 = 0.05;
 
-/// Size of the photos. In words either a number of pixels, 4 wide to 3 high, or width and height as
+/// Size of the photos. As text, either a number of pixels (at 4:3), or width and height as in
 /// 1920x1080.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct PhotoSize {
-    /// Pixels in a row.
+    /// Width in pixels.
     pub width: u32,
-    /// Rows.
+    /// Height in pixels.
     pub height: u32,
 }
 
@@ -34,7 +34,7 @@ pub struct PhotoSize {
 const SIDE_MAX: u32 = 1 << 16;
 
 impl PhotoSize {
-    /// About so many pixels, 4 wide to 3 high; at least one.
+    /// A 4:3 size with approximately this many pixels; at least one.
     pub fn of_pixels(pixels: usize) -> Self {
         let pixels = pixels.max(1) as f64;
         let width = (pixels * 4.0 / 3.0).sqrt().round().max(1.0);
@@ -44,7 +44,7 @@ impl PhotoSize {
         }
     }
 
-    /// Pixels.
+    /// Number of pixels.
     pub fn pixels(self) -> usize {
         self.width as usize * self.height as usize
     }
@@ -84,12 +84,12 @@ impl FromStr for PhotoSize {
     }
 }
 
-/// Points at random on sheets across the view, as dense on the screen in each, and four cameras
-/// before them.
+/// Random points on sheets across the view, equally dense on the screen in each, and four cameras
+/// in front of them.
 ///
-/// A Gaussian's first size is the distance to its neighbours, so a pixel has about as many
-/// Gaussians, some 13 for each sheet, however many there are in all; until they become smaller than
-/// a pixel and the low-pass filter keeps them there.
+/// A Gaussian's initial size is the distance to its neighbours, so the number of Gaussians per
+/// pixel, about 13 for each sheet, does not depend on their total, until they become smaller than a
+/// pixel and the low-pass filter limits their size.
 pub fn synthetic_capture(gaussians: usize, size: PhotoSize) -> Capture {
     let PhotoSize { width, height } = size;
     let views = (0..VIEWS).map(|index| view(index, width, height)).collect();
@@ -123,7 +123,7 @@ pub fn synthetic_capture(gaussians: usize, size: PhotoSize) -> Capture {
 fn view(index: usize, width: u32, height: u32) -> View {
     let (w, h) = (f64::from(width), f64::from(height));
     let side = |bit: usize| STEP * if index & bit == 0 { 1.0 } else { -1.0 };
-    // Waves of a few dozen pixels: nothing that depends on the size of the image.
+    // Waves of a few dozen pixels, independent of the image size.
     let image = (0..height)
         .flat_map(|y| (0..width).map(move |x| (x, y)))
         .flat_map(|(x, y)| {
@@ -194,7 +194,7 @@ mod tests {
             let share = inside.count() as f64 / 1000.0;
             assert!((0.75..0.9).contains(&share), "{share}");
         }
-        // Nothing to see is no error here.
+        // An empty scene is not an error.
         let nothing = synthetic_capture(0, PhotoSize::of_pixels(0));
         assert_eq!(nothing.points.len(), 0);
         assert_eq!(nothing.image_sizes()[0], (1, 1, VIEWS));
