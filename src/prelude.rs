@@ -1,5 +1,5 @@
-//! What most programs use. It has the module `burn` too, which Burn's derives name: with
-//! `use burn_splat::prelude::*;` `#[derive(Module)]` works in a crate that depends on nothing else.
+//! Common imports. The prelude includes the module `burn`, which Burn's derives refer to: after
+//! `use burn_splat::prelude::*;`, `#[derive(Module)]` works in a crate with no other dependency.
 
 pub use burn;
 pub use burn::module::{Module, Param};

@@ -1,9 +1,9 @@
 //! Every gradient agrees with PyTorch, on every device and in every precision.
 //!
-//! The fixtures in `tests/fixtures` are scenes with the pictures and gradients of a brute-force
-//! float64 renderer (`generate.py`). Gates, on the relative L2 error of every parameter group and
-//! picture: 1e-9 in double precision, 1e-5 in single precision, 1e-3 for the scenes marked hard.
-//! The negative controls switch on known bugs and demand that the same gates notice.
+//! The fixtures in `tests/fixtures` are scenes with the images and gradients of a brute-force
+//! float64 renderer (`generate.py`). The gates on the relative L2 error of every parameter group
+//! and image are 1e-9 in double precision, 1e-5 in single precision, and 1e-3 for scenes marked
+//! hard. The negative controls switch on known bugs, which the same gates must catch.
 
 #[cfg(feature = "wgpu")]
 mod adapter;
@@ -13,7 +13,7 @@ use std::path::PathBuf;
 use burn::tensor::Device;
 use splat_lab::gradcheck::{Bug, FileReport, Fixture, Precision, check, check_file, run, table};
 
-/// All fixtures, in the order of their names.
+/// All fixtures, sorted by name.
 fn fixtures() -> Vec<PathBuf> {
     let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/fixtures");
     let mut files: Vec<_> = std::fs::read_dir(folder)
@@ -38,7 +38,7 @@ fn fixture(name: &str) -> Fixture {
     Fixture::read(&path).unwrap_or_else(|error| panic!("{error}"))
 }
 
-/// Checks every fixture, prints one line each, and fails with the full table of those that fail.
+/// Checks every fixture, prints one line for each, and fails with the full table of the failures.
 fn check_all(device: &Device, precision: Precision) {
     let reports: Vec<FileReport> = fixtures()
         .iter()
@@ -86,7 +86,7 @@ mod cpu {
         check_all(&Device::flex(), Precision::F32);
     }
 
-    /// The picture does not depend on a quaternion's length or sign, and no gradient lies along it.
+    /// The image does not depend on a quaternion's length or sign, and no gradient is along it.
     #[test]
     fn quaternion_length_and_sign_change_nothing() {
         let computed = |name| {
@@ -118,7 +118,8 @@ mod cpu {
         }
     }
 
-    /// Runs every fixture with a bug; returns the names of those that fail and the groups that do.
+    /// Runs every fixture with a bug; returns the names of the failing ones with their failing
+    /// groups.
     fn caught(bug: Bug, precision: Precision) -> Vec<(String, Vec<&'static str>, bool)> {
         fixtures()
             .iter()
@@ -140,8 +141,8 @@ mod cpu {
             .collect()
     }
 
-    /// The bug must make `fixture` fail in all of `groups`, in both precisions. A bug of the
-    /// backward alone must leave the pictures right: it is the gradients that give it away.
+    /// The bug must make `fixture` fail in all of `groups`, in both precisions. A bug in the
+    /// backward pass alone must leave the images correct: only the gradients reveal it.
     fn must_be_caught(bug: Bug, fixture: &str, groups: &[&str], pictures_right: bool) {
         for precision in [Precision::F64, Precision::F32] {
             let caught = caught(bug, precision);

@@ -95,7 +95,8 @@ hard_cases! {
     case_38_relocation: 38,
 }
 
-/// Needles up to 10,000 : 1: determinant to 1e-3, exponent to 1e-2, and nothing visible is culled.
+/// Needles up to 10,000 : 1: the determinant is accurate to 1e-3 and the exponent to 1e-2, and
+/// nothing visible is culled.
 fn check_projection(backend: &str, device: &Device) {
     let errors = splat_lab::accuracy::projection::projection_errors(1_000_000, 1, device)
         .unwrap_or_else(|error| panic!("{backend}: {error}"));

@@ -1,6 +1,6 @@
-//! Infinity is a value: opacity logits of plus and minus infinity are opacities of 1 and 0, a
-//! log-scale of minus infinity is a flat Gaussian. They render as their limits, and training leaves
-//! them and everything beside them in order.
+//! Infinity is a valid value: opacity logits of plus and minus infinity are opacities of 1 and 0,
+//! and a log-scale of minus infinity is a flat Gaussian. They render as their limits, and training
+//! leaves them and their neighbours intact.
 #![cfg(feature = "cpu")]
 
 #[cfg(feature = "wgpu")]
@@ -68,13 +68,13 @@ fn infinities_render_as_their_limits() {
     for device in devices() {
         let infinite = scene([f32::INFINITY, f32::NEG_INFINITY, f32::NEG_INFINITY]);
         let found = image(&infinite, &device);
-        // A sigmoid of 90 is 1 in single precision; e^-60 is a scale that nothing sees.
+        // A sigmoid of 90 is 1 in single precision; a scale of e^-60 is invisible.
         let limit = image(&scene([90.0, -90.0, -60.0]), &device);
         assert!(limit.iter().any(|value| *value > 0.5), "{device:?}");
         let error = found.iter().zip(&limit).map(|(a, b)| (a - b).abs());
         let error = error.fold(0.0, f32::max);
         assert!(error <= 1e-6, "{device:?}: {error:e}");
-        // Each is seen or not as it should be.
+        // Each is visible or invisible as it should be.
         let mut without = infinite.clone();
         without.opacity_logits[1] = f32::NEG_INFINITY;
         assert_ne!(image(&without, &device), found, "{device:?}");

@@ -1,8 +1,8 @@
-//! Which branches of the readers have been taken, where they were compiled with LLVM's counters
-//! (`fuzz/instrument.sh`); in a build without them there are none, and everything here is empty.
+//! Branch coverage of the readers, if they were compiled with LLVM's counters
+//! (`fuzz/instrument.sh`). In other builds there are no counters, and everything here is empty.
 //!
-//! The compiler puts an 8-bit counter on every edge of the control flow and calls the two functions
-//! below at the start of the program, with all counters and with an address and a flag for each.
+//! The compiler puts an 8-bit counter on every edge of the control flow. At program start it calls
+//! the two functions below with all counters, and with an address and flags for each.
 
 use std::sync::OnceLock;
 use std::sync::atomic::{AtomicU8, Ordering};
@@ -18,16 +18,16 @@ struct Place {
 static COUNTERS: OnceLock<&'static [AtomicU8]> = OnceLock::new();
 static PLACES: OnceLock<&'static [Place]> = OnceLock::new();
 
-/// Called by every instrumented unit, always with the same range: the linker has joined them.
+/// Called by every instrumented unit, always with the same range, as the linker has merged them.
 ///
 /// # Safety
-/// `start..stop` are bytes that live as long as the program.
+/// `start..stop` must be bytes that live as long as the program.
 #[unsafe(no_mangle)]
 unsafe extern "C" fn __sanitizer_cov_8bit_counters_init(
     start: *const AtomicU8,
     stop: *const AtomicU8,
 ) {
-    // SAFETY: the caller's promise; the counters are only added to, byte by byte.
+    // SAFETY: guaranteed by the caller; the counters are only incremented, byte by byte.
     COUNTERS.get_or_init(|| unsafe {
         std::slice::from_raw_parts(start, stop.offset_from_unsigned(start))
     });
@@ -36,19 +36,19 @@ unsafe extern "C" fn __sanitizer_cov_8bit_counters_init(
 /// The same for the addresses.
 ///
 /// # Safety
-/// `start..stop` are entries that live as long as the program.
+/// `start..stop` must be entries that live as long as the program.
 #[unsafe(no_mangle)]
 unsafe extern "C" fn __sanitizer_cov_pcs_init(start: *const Place, stop: *const Place) {
-    // SAFETY: the caller's promise.
+    // SAFETY: guaranteed by the caller.
     PLACES.get_or_init(|| unsafe {
         std::slice::from_raw_parts(start, stop.offset_from_unsigned(start))
     });
 }
 
-/// What all runs of a campaign have reached.
+/// Coverage of all runs of a campaign.
 #[derive(Default)]
 pub struct Reached {
-    /// Per edge a bit for each magnitude of its counter that was seen.
+    /// Per edge, one bit for each magnitude of its counter seen so far.
     seen: Vec<u8>,
 }
 
@@ -57,18 +57,18 @@ pub struct Reached {
 pub struct Edges {
     /// Taken at least once.
     pub taken: usize,
-    /// In all.
+    /// Total number.
     pub present: usize,
-    /// In so many functions.
+    /// Number of functions.
     pub functions: usize,
 }
 
-/// Whether there are counters.
+/// True if there are counters.
 pub fn is_counted() -> bool {
     !counters().is_empty()
 }
 
-/// Sets all counters to zero.
+/// Resets all counters.
 pub fn clear() {
     for counter in counters() {
         counter.store(0, Ordering::Relaxed);
@@ -80,7 +80,7 @@ fn counters() -> &'static [AtomicU8] {
 }
 
 impl Reached {
-    /// Adds the counters as they are; says whether any shows something new.
+    /// Adds the current counters; returns true if any shows something new.
     pub fn add(&mut self) -> bool {
         let counters = counters();
         self.seen.resize(counters.len(), 0);

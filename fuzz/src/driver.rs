@@ -1,4 +1,4 @@
-//! Runs a target over and over: mutate, run, judge, and keep what reached something new.
+//! The fuzzing loop: mutate, run, judge, and keep inputs that reach something new.
 
 use std::cell::Cell;
 use std::collections::HashSet;
@@ -18,38 +18,38 @@ use crate::formats::{Input, Target};
 use crate::memory::peak_of;
 use crate::mutate;
 
-/// An input that takes longer is taken for one that never ends.
+/// Time after which an input counts as hanging.
 const LONGEST: Duration = Duration::from_secs(60);
-/// Longest input, in bytes: every fault that needs a longer one needs a small one first.
+/// Longest input in bytes: faults that need longer ones usually start with small ones.
 const LARGEST: usize = 1 << 16;
-/// Most inputs that are kept to go on from.
+/// Most inputs kept for further mutation.
 const CORPUS: usize = 4_096;
 
-/// What a campaign has done.
+/// Statistics of a campaign.
 #[derive(Debug, Clone, Default)]
 pub struct Report {
     /// Inputs run.
     pub executions: u64,
-    /// Those that the reader let through.
+    /// Inputs accepted by the reader.
     pub accepted: u64,
-    /// Those of them that were handed on.
+    /// Accepted inputs passed on to the next stage.
     pub followed: u64,
-    /// Those of them that whoever they were handed to took.
+    /// Passed-on inputs that the next stage accepted.
     pub taken: u64,
-    /// Different outcomes: messages without their numbers and quotations.
+    /// Distinct outcomes: messages without numbers and quotations.
     pub outcomes: usize,
     /// Inputs kept.
     pub corpus: usize,
-    /// Branches, where they are counted.
+    /// Branches, if they are counted.
     pub edges: Edges,
-    /// Largest peak of memory beyond the constant, over the input's length.
+    /// Largest peak of memory beyond the constant, relative to the input's length.
     pub memory: f64,
 }
 
 /// An input that fails, and how.
 #[derive(Debug)]
 pub struct Failed {
-    /// What went wrong.
+    /// The reason.
     pub reason: String,
     /// The input's files.
     pub files: Vec<PathBuf>,
@@ -61,27 +61,27 @@ impl std::fmt::Display for Failed {
     }
 }
 
-/// A target under way.
+/// A running campaign of a target.
 pub struct Campaign {
     target: &'static Target,
     rng: Pcg64Mcg,
-    /// The seeds, and what reached something new.
+    /// The seeds, and inputs that reached something new.
     corpus: Vec<Input>,
     seeds: usize,
-    /// Of the corpus, what the reader lets through.
+    /// Inputs of the corpus that the reader accepts.
     valid: Vec<usize>,
     reached: Reached,
     outcomes: HashSet<u64>,
     watch: Watch,
-    /// So far.
+    /// Statistics so far.
     pub report: Report,
 }
 
 impl Campaign {
-    /// Begins with the target's seeds, which are run as they are.
+    /// Starts with the target's seeds, run unmodified.
     ///
     /// # Errors
-    /// When a seed fails, or is not let through: it would be no start.
+    /// When a seed fails or is refused; it would be useless as a start.
     pub fn new(target: &'static Target, seed: u64) -> Result<Self, Failed> {
         let mut campaign = Self {
             target,
@@ -113,9 +113,9 @@ impl Campaign {
     /// Runs one new input.
     ///
     /// # Errors
-    /// When it fails.
+    /// When the input fails.
     pub fn step(&mut self) -> Result<(), Failed> {
-        // What is broken already seldom becomes whole: two of three begin with something valid.
+        // A broken input seldom becomes valid again: two of three mutations start from a valid one.
         let at = match self.rng.random_range(0..3) {
             0 => mutate::place(&mut self.rng, self.seeds),
             1 => *mutate::one_of(&mut self.rng, &self.valid),
@@ -158,11 +158,11 @@ impl Campaign {
         }
     }
 
-    /// Runs an input; says whether it did something new. What is let through is handed on now and
-    /// then, or always.
+    /// Runs an input; returns true if it did something new. Accepted inputs are passed on
+    /// sometimes, or `always`.
     ///
     /// # Errors
-    /// When it fails.
+    /// When the input fails.
     pub fn execute(&mut self, input: &Input, always: bool) -> Result<bool, Failed> {
         self.watch.begin(input);
         self.report.executions += 1;
@@ -214,7 +214,7 @@ impl Campaign {
         Ok(news)
     }
 
-    /// The report, with the branches so far.
+    /// The report, including branches.
     pub fn finish(mut self) -> Report {
         self.report.edges = self.reached.edges();
         self.report
@@ -243,7 +243,7 @@ impl Campaign {
     }
 }
 
-/// The end of a message, without what differs from input to input: numbers, and what is quoted.
+/// End of a message without the parts that differ between inputs: numbers and quotations.
 fn gist(message: &str) -> String {
     let outside: Vec<&str> = message.split(['`', '\'']).step_by(2).collect();
     let words = outside.concat();
@@ -257,12 +257,12 @@ fn hash_of(value: &impl Hash) -> u64 {
     hasher.finish()
 }
 
-/// Keeps the present input in a file, which is there after an abort, and ends the process when it
-/// takes too long.
+/// Keeps the current input in a file, which survives an abort, and ends the process if the input
+/// hangs.
 struct Watch {
     path: PathBuf,
     file: Option<std::fs::File>,
-    /// Number of the present input, from 1; 0 between two.
+    /// Number of the current input, from 1; 0 between inputs.
     present: Arc<AtomicU64>,
     count: Cell<u64>,
 }
@@ -288,7 +288,7 @@ impl Watch {
         self.present.store(self.count.get(), Ordering::Relaxed);
         if let Some(mut file) = self.file.as_ref() {
             let bytes = input.0.concat();
-            // Without the file a failure that aborts is repeated by its seed all the same.
+            // Without the file, an aborting failure can still be reproduced by its seed.
             let _ = file
                 .rewind()
                 .and_then(|()| file.write_all(&bytes))
@@ -301,7 +301,7 @@ impl Watch {
     }
 }
 
-/// Looks at a campaign until it is gone. Time is counted by the looks: none are taken while the
+/// Watches a campaign until it ends. Time is measured by polls, of which none happen while the
 /// process is stopped.
 fn watch(present: &Weak<AtomicU64>, path: &std::path::Path) {
     const PAUSE: Duration = Duration::from_millis(500);

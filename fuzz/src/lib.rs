@@ -1,22 +1,21 @@
-//! Fuzz targets of everything that reads a file: does any input make it panic, hang, or take more
-//! memory than its size allows?
+//! Fuzz targets for all file readers: no input may make them panic, hang, or use more memory than
+//! its size allows.
 //!
 //! ```text
 //! formats/ (seeds, mutations, what is run) ──> driver ──> memory (peak of every run), coverage (if compiled for it)
 //! ```
 //!
-//! Inputs are made from small valid files, which are made here, by mutations that know the format
-//! ([`formats`]) and by some that know nothing ([`mutate`]). What a reader lets through is handed
-//! on now and then, as the program would: a capture is trained on, a scene rendered, a checkpoint
-//! resumed.
+//! Inputs are derived from small valid files, which are generated here, by mutations that know the
+//! format ([`formats`]) and by generic ones ([`mutate`]). Some accepted inputs are passed on, as in
+//! the program: a capture is trained, a scene rendered, a checkpoint resumed.
 //!
-//! - `cargo test --release --workspace` runs a few seconds of each, from fixed seeds: a failure
-//!   comes again.
-//! - `fuzz/run.sh PARSER... SECONDS` compiles the readers with counters on their branches, which
-//!   guide the search, and runs for that much time of the processor each. Stable Rust is enough,
-//!   and nothing is installed.
+//! - `cargo test --release --workspace` runs a few seconds of each target from fixed seeds, so
+//!   failures are reproducible.
+//! - `fuzz/run.sh PARSER... SECONDS` compiles the readers with branch counters, which guide the
+//!   search, and runs each for that much processor time. It needs only stable Rust and installs
+//!   nothing.
 //!
-//! An input that fails is written to `fuzz/failures/`; `splat-fuzz PARSER --replay FILE...` runs it
+//! A failing input is written to `fuzz/failures/`; `splat-fuzz PARSER --replay FILE...` runs it
 //! again.
 
 pub mod coverage;

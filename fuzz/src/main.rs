@@ -14,10 +14,10 @@ struct Args {
     /// Readers: colmap_binary, colmap_text, ply, fixture, checkpoint, config, gaussians; all
     #[arg(required = true)]
     parsers: Vec<String>,
-    /// Time of the processor for each
+    /// Processor time for each, in seconds
     #[arg(long, default_value_t = 10.0)]
     seconds: f64,
-    /// Of every random draw
+    /// Seed of every random draw
     #[arg(long, default_value_t = 1)]
     seed: u64,
     /// Run the input in these files instead, one for each of its parts
@@ -104,20 +104,20 @@ fn line(target: &Target, report: &Report) -> String {
     )
 }
 
-/// Time of the processor that this process has taken, all its threads together.
+/// Processor time used by this process, over all threads.
 #[cfg(unix)]
 fn processor_seconds() -> f64 {
     let mut time = libc::timespec {
         tv_sec: 0,
         tv_nsec: 0,
     };
-    // SAFETY: `time` is a place for the answer.
+    // SAFETY: `time` is valid for writing.
     let status = unsafe { libc::clock_gettime(libc::CLOCK_PROCESS_CPUTIME_ID, &mut time) };
     assert_eq!(status, 0, "the system does not tell the process's time");
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
-/// Time by the clock, elsewhere.
+/// Wall-clock time on other systems.
 #[cfg(not(unix))]
 fn processor_seconds() -> f64 {
     static START: std::sync::OnceLock<std::time::Instant> = std::sync::OnceLock::new();

@@ -1,9 +1,9 @@
-//! An allocator that counts what a thread holds.
+//! An allocator that counts the bytes held by each thread.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
-/// The system's allocator, and a count of bytes for each thread.
+/// The system's allocator, with a byte count per thread.
 pub struct Counting;
 
 thread_local! {
@@ -12,7 +12,7 @@ thread_local! {
 }
 
 fn add(bytes: usize) {
-    // A thread that is being torn down allocates too.
+    // A thread being torn down allocates too.
     let _ = HELD.try_with(|held| {
         held.set(held.get().wrapping_add_unsigned(bytes));
         let _ = PEAK.try_with(|peak| peak.set(peak.get().max(held.get())));
@@ -23,11 +23,11 @@ fn sub(bytes: usize) {
     let _ = HELD.try_with(|held| held.set(held.get().wrapping_sub_unsigned(bytes)));
 }
 
-// SAFETY: everything is the system's allocator; counting allocates nothing.
+// SAFETY: everything is delegated to the system's allocator; counting allocates nothing.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         add(layout.size());
-        // SAFETY: the caller's promises are those of the system's allocator.
+        // SAFETY: the caller's promises are those that the system's allocator requires.
         unsafe { System.alloc(layout) }
     }
 
@@ -44,7 +44,7 @@ unsafe impl GlobalAlloc for Counting {
     }
 
     unsafe fn realloc(&self, pointer: *mut u8, layout: Layout, size: usize) -> *mut u8 {
-        // Both blocks may be there at once.
+        // Both blocks may exist at once.
         add(size);
         sub(layout.size());
         // SAFETY: as above.
@@ -52,7 +52,7 @@ unsafe impl GlobalAlloc for Counting {
     }
 }
 
-/// The most that this thread held during a call, in bytes beyond what it held before.
+/// Peak bytes held by this thread during a call, beyond those held before.
 pub fn peak_of<T>(call: impl FnOnce() -> T) -> (T, usize) {
     let before = HELD.get();
     PEAK.set(before);

@@ -1,9 +1,9 @@
-//! Mutations that know no format: of bytes, and of lines and words of text.
+//! Generic mutations of bytes, and of lines and words of text.
 
 use rand::{Rng, RngExt};
 use rand_pcg::Pcg64Mcg;
 
-/// Numbers at the ends of types, and around sizes that somebody may want to allocate.
+/// Limits of integer types, and numbers near sizes that might be allocated.
 const NUMBERS: [u64; 16] = [
     0,
     1,
@@ -23,7 +23,7 @@ const NUMBERS: [u64; 16] = [
     u64::MAX,
 ];
 
-/// Numbers that are none, are at the ends of types, or underflow where they are squared.
+/// Non-finite numbers, limits of types, and numbers that underflow when squared.
 const REALS: [f64; 16] = [
     f64::NAN,
     f64::INFINITY,
@@ -43,7 +43,7 @@ const REALS: [f64; 16] = [
     1e16,
 ];
 
-/// Words that parsers of text stumble over.
+/// Words that text parsers stumble over.
 pub const WORDS: [&str; 26] = [
     "nan",
     "NaN",
@@ -73,7 +73,7 @@ pub const WORDS: [&str; 26] = [
     "\0",
 ];
 
-/// A place in `0..len`.
+/// An index in `0..len`.
 pub fn place(rng: &mut Pcg64Mcg, len: usize) -> usize {
     if len == 0 {
         0
@@ -87,7 +87,7 @@ pub fn one_of<'a, T>(rng: &mut Pcg64Mcg, of: &'a [T]) -> &'a T {
     &of[place(rng, of.len())]
 }
 
-/// A number to put where a count or an id is.
+/// A number in place of a count or an id.
 pub fn number(rng: &mut Pcg64Mcg) -> u64 {
     match rng.random_range(0..3) {
         0 => rng.random_range(0..10),
@@ -95,7 +95,7 @@ pub fn number(rng: &mut Pcg64Mcg) -> u64 {
     }
 }
 
-/// A number to put where a coordinate is.
+/// A number in place of a coordinate.
 pub fn real(rng: &mut Pcg64Mcg) -> f64 {
     match rng.random_range(0..3) {
         0 => rng.random_range(-10.0..10.0),
@@ -110,7 +110,7 @@ fn range(rng: &mut Pcg64Mcg, len: usize, longest: usize) -> std::ops::Range<usiz
     start..start + count
 }
 
-/// Changes bytes without regard to what they mean.
+/// Mutates bytes without regard to their meaning.
 pub fn bytes(bytes: &mut Vec<u8>, rng: &mut Pcg64Mcg) {
     let len = bytes.len();
     match rng.random_range(0..9) {
@@ -149,7 +149,7 @@ pub fn bytes(bytes: &mut Vec<u8>, rng: &mut Pcg64Mcg) {
     }
 }
 
-/// Writes eight bytes somewhere, more often than not where a field may begin.
+/// Overwrites eight bytes somewhere, usually where a field may begin.
 fn overwrite(bytes: &mut [u8], rng: &mut Pcg64Mcg, new: impl Fn(&mut Pcg64Mcg) -> [u8; 8]) {
     let mut at = place(rng, bytes.len());
     if rng.random_bool(0.7) {
@@ -160,8 +160,7 @@ fn overwrite(bytes: &mut [u8], rng: &mut Pcg64Mcg, new: impl Fn(&mut Pcg64Mcg) -
     bytes[at..at + count].copy_from_slice(&new[..count]);
 }
 
-/// Changes a text by lines and by words; `words` are those of its format. Lines end as they did, or
-/// not.
+/// Mutates a text by lines and words; `words` are those of its format. Line ends are mostly kept.
 pub fn text(text: &mut Vec<u8>, words: &[&str], rng: &mut Pcg64Mcg) {
     let mut lines: Vec<Vec<u8>> = text
         .split(|byte| *byte == b'\n')
@@ -190,7 +189,7 @@ pub fn text(text: &mut Vec<u8>, words: &[&str], rng: &mut Pcg64Mcg) {
     *text = lines.join(&b'\n');
 }
 
-/// Changes a word of a line.
+/// Mutates a word of a line.
 fn word(line: &mut Vec<u8>, words: &[&str], rng: &mut Pcg64Mcg) {
     let mut parts: Vec<Vec<u8>> = line
         .split(|byte| *byte == b' ')

@@ -1,5 +1,5 @@
-//! Some seconds of fuzzing of every reader, always the same inputs. `fuzz/run.sh` goes on from
-//! there.
+//! A few seconds of fuzzing of every reader, always with the same inputs. `fuzz/run.sh` continues
+//! from there.
 
 use splat_fuzz::{Campaign, TARGETS};
 

@@ -1,4 +1,4 @@
-//! What the rasteriser promises of colours, alpha and transmittance.
+//! Properties of the rasteriser's colours, alpha and transmittance.
 
 use burn::tensor::DType;
 use burn_splat::ops::{Projected, RasterizeSettings, rasterize};
@@ -8,7 +8,7 @@ use proptest::prelude::*;
 use super::scene::{PIXELS, SIZE, Scene, Upload, host, scenes, thresholds};
 use super::support::{close, config, identical, weights};
 
-/// A picture of D channels, and the gradients of a weighted sum over it.
+/// An image of D channels, and the gradients of a weighted sum over it.
 struct Blended {
     /// `[H, W, D]`.
     image: Vec<f64>,
@@ -60,7 +60,7 @@ fn blend(
     }
 }
 
-/// Alpha alone, `[H, W]`: colours do not matter.
+/// Alpha only, `[H, W]`, independent of colours.
 fn alpha(scene: &Scene, settings: &RasterizeSettings, dtype: DType) -> Vec<f64> {
     let colors = vec![1.0; scene.len()];
     blend(
@@ -74,7 +74,7 @@ fn alpha(scene: &Scene, settings: &RasterizeSettings, dtype: DType) -> Vec<f64> 
     .alpha
 }
 
-/// A scene, and features for its Gaussians and for the background, `[N + 1, channels]`.
+/// A scene, with features for its Gaussians and the background, `[N + 1, channels]`.
 fn with_features(channels: usize) -> impl Strategy<Value = (Scene, Vec<f64>)> {
     scenes(1..=12).prop_flat_map(move |scene| {
         let features = vec(-1.0..1.0, (scene.len() + 1) * channels);
@@ -94,8 +94,8 @@ fn channels(values: &[f64], width: usize, range: core::ops::Range<usize>) -> Vec
 proptest! {
     #![proptest_config(config(48))]
 
-    /// Channels do not know of each other: rendered in two batches each has the same bits, and so
-    /// has its gradient; the gradients of what they share add up.
+    /// Channels are independent: rendered in two batches, each has the same bits, and so has its
+    /// gradient; gradients of shared inputs add up.
     #[test]
     fn splitting_channels_changes_no_bit((scene, features) in with_features(5), cut in 1..5usize) {
         let settings = RasterizeSettings::default();
@@ -132,8 +132,8 @@ proptest! {
         close("opacities", &sum(&left.opacities, &right.opacities), &whole.opacities, 1e-11)?;
     }
 
-    /// The image of `a c + b c'` is a times that of c plus b times that of c', the background being
-    /// one more colour.
+    /// The image of `a c + b c'` is a times that of c plus b times that of c', with the background
+    /// as one more colour.
     #[test]
     fn the_image_is_linear_in_colours(
         (scene, features) in with_features(6),
@@ -156,8 +156,8 @@ proptest! {
         }
     }
 
-    /// The weights of the splats and of the background are at least 0 and sum to 1; the
-    /// background's is 1 - alpha.
+    /// The weights of splats and background are non-negative and sum to 1; the background's is 1 -
+    /// alpha.
     #[test]
     fn the_background_gets_what_alpha_leaves((scene, features) in with_features(1)) {
         let settings = RasterizeSettings::default();
@@ -197,12 +197,12 @@ proptest! {
         }
     }
 
-    /// One more splat, anywhere in the order, lets no more light through at any pixel, to the last
-    /// bit of single precision.
+    /// An additional splat, anywhere in the order, does not increase the light at any pixel, to the
+    /// last bit of single precision.
     ///
-    /// With the early stop that holds behind all others only. In front, a pixel may now stop before
-    /// a splat that it blended before; but it stops only where no more light is left than
-    /// `transmittance_min / (1 - alpha_max)`.
+    /// With the early stop this holds only for a splat behind all others. In front, a pixel may
+    /// stop before a splat that it blended otherwise; but then at most `transmittance_min / (1 -
+    /// alpha_max)` of light is left.
     #[test]
     fn one_more_splat_lets_no_more_light_through(
         scene in scenes(2..=10),

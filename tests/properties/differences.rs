@@ -1,9 +1,9 @@
-//! The gradient of each op by itself against central differences in double precision:
-//! `splat_lab::central`, along random directions over each input.
+//! Gradients of each op against central differences in double precision, by `splat_lab::central`,
+//! along random directions over each input.
 //!
-//! The ops are smooth but where they decide: culled or not, clamped or not, below the cut of alpha,
-//! at its cap, stopped. Steps shrink until no decision changes on them. The last test counts the
-//! decisions.
+//! The ops are smooth except at decisions: culled or not, clamped or not, below the cut of alpha,
+//! at its cap, stopped. Steps shrink until no decision changes within them. The last test counts
+//! the decisions.
 
 use burn::tensor::Tensor;
 use burn_splat::ops::{
@@ -17,19 +17,19 @@ use splat_lab::central::{CheckError, Coverage, Report, Settings, gradcheck_with,
 use super::scene::{COEFFS, SIZE, Scene, host, rotations, rows, scenes, thresholds, vectors};
 use super::support::{config, weights};
 
-/// Gate on the difference of derivatives along a direction, relative to the root of the sum of
-/// squares of its elements'.
+/// Gate on the difference of derivatives along a direction, relative to the root of the sum of the
+/// squared derivatives of its elements.
 const GATE: f64 = 1e-7;
-/// The largest error at a single element that may go unseen, in units of the root mean square
+/// Largest error at a single element that may go unseen, in units of the root mean square
 /// derivative. Measured: 3e-6.
 const UNSEEN: f64 = 1e-5;
-/// Per tensor; together they find any error that is not orthogonal to all of them.
+/// Directions per tensor; together they detect any error that is not orthogonal to all of them.
 const DIRECTIONS: usize = 4;
-/// Gaussians of a case.
+/// Gaussians per case.
 const COUNT: usize = 8;
 const CAMERAS: usize = 2;
 
-/// Of all inputs' elements at once, in other directions for every seed.
+/// Directions over all elements of all inputs, different for every seed.
 fn along_directions(seed: u64) -> Settings {
     Settings::new()
         .with_tolerance(GATE)
@@ -38,7 +38,7 @@ fn along_directions(seed: u64) -> Settings {
         .with_seed(seed)
 }
 
-/// Whether all gradients agree, and whether an error would have been seen.
+/// Checks that all gradients agree, and that an error would have been seen.
 fn judge(report: Result<Report, CheckError>) -> Result<(), TestCaseError> {
     let report = report.map_err(|error| TestCaseError::fail(error.to_string()))?;
     prop_assert!(report.is_ok(), "{report}");
@@ -123,14 +123,14 @@ fn run_rasterize(
         .packed()
 }
 
-/// Columns of the screen splats that are differentiated: mean and inverse Cholesky factor. Depth
-/// and extents only order and cull, the compensation is not read.
+/// Differentiable columns of the screen splats: mean and inverse Cholesky factor. Depth and extents
+/// only order and cull; the compensation is not read.
 fn differentiated(packed: &Tensor<3>) -> Tensor<3> {
     let columns = |start, length| packed.clone().narrow(2, start, length);
     Tensor::cat(vec![columns(0, 2), columns(3, 3)], 2)
 }
 
-/// `packed` with other values in the columns that are differentiated.
+/// `packed` with other values in the differentiable columns.
 fn with_differentiated(packed: &Tensor<3>, values: Tensor<3>) -> Tensor<3> {
     let kept = |start, length| packed.clone().narrow(2, start, length);
     let new = |start, length| values.clone().narrow(2, start, length);
@@ -215,7 +215,7 @@ proptest! {
     }
 }
 
-/// The scenes above come by every decision, so that no branch goes unchecked.
+/// The scenes above meet every decision, so that no branch is unchecked.
 #[test]
 fn random_scenes_come_by_every_decision() {
     use proptest::test_runner::TestRunner;
@@ -232,7 +232,7 @@ fn random_scenes_come_by_every_decision() {
                     found.borrow_mut()[usize::from(decision)] += 1;
                 }
                 let decisions = project_decisions(&scene, &viewmats, &intrinsics);
-                // Extents of visible splats first, then the places relative to the clamp.
+                // Extents of visible splats first, then the positions relative to the clamp.
                 let (extents, clamps) = decisions.split_at(2 * CAMERAS * COUNT);
                 let visible = extents.chunks_exact(2).map(|e| e[0] > 0);
                 let clamped = clamps.chunks_exact(2).map(|c| c != [1, 1]);
@@ -284,7 +284,7 @@ const BLENDED: u8 = 1;
 const CAPPED: u8 = 2;
 const STOPPED: u8 = 3;
 
-/// What becomes of every splat at every pixel.
+/// The decision for every splat at every pixel.
 fn rasterize_decisions(packed: &[f64], opacities: &[f64], settings: &RasterizeSettings) -> Vec<u8> {
     let mut decisions = Vec::new();
     let cameras = packed.chunks_exact(9 * COUNT);

@@ -1,7 +1,7 @@
-//! What may change without changing the picture, and how the gradients follow.
+//! Changes that leave the image unchanged, and their effect on the gradients.
 //!
-//! Double precision unless bits are compared. Tolerances are relative L2 errors per tensor, ten to
-//! sixty times the largest one measured over these cases.
+//! Double precision, unless bits are compared. Tolerances are relative L2 errors per tensor, ten to
+//! sixty times the largest error measured over these cases.
 
 use burn::tensor::DType;
 use glam::{DMat4, DVec3};
@@ -10,7 +10,7 @@ use proptest::prelude::*;
 use super::scene::{COEFFS, Outcome, Scene, quat, rotations, rows, scenes, vectors};
 use super::support::{close, config, identical, map_rows, norm, reorder};
 
-/// Every picture and gradient of `a` against that of `b`.
+/// Compares every image and gradient of `a` with that of `b`.
 fn all_close(a: &Outcome, b: &Outcome, tolerance: f64) -> Result<(), TestCaseError> {
     close("image", &a.image, &b.image, tolerance)?;
     close("alpha", &a.alpha, &b.alpha, tolerance)?;
@@ -27,8 +27,8 @@ fn all_close(a: &Outcome, b: &Outcome, tolerance: f64) -> Result<(), TestCaseErr
 proptest! {
     #![proptest_config(config(48))]
 
-    /// q and k q are one rotation for every k but 0: same picture, gradient divided by k, and none
-    /// of it along q.
+    /// q and k q are the same rotation for every k but 0: the image is the same, the gradient is
+    /// divided by k, and none of it is along q.
     #[test]
     fn quaternion_sign_and_length_change_nothing(
         scene in scenes(1..=8),
@@ -50,9 +50,8 @@ proptest! {
         all_close(&other, &plain, 1e-12)?;
     }
 
-    /// The order of Gaussians at different depths is nothing but a name: same bits in single
-    /// precision. Only what is summed over the Gaussians (the camera's gradient) is summed in
-    /// another order.
+    /// The order of Gaussians at different depths is irrelevant: same bits in single precision.
+    /// Only sums over Gaussians (the camera's gradient) are in another order.
     #[test]
     fn permuting_gaussians_changes_no_bit(
         (scene, order) in scenes(2..=12).prop_flat_map(|scene| {
@@ -82,8 +81,9 @@ proptest! {
         close("intrinsics", &other.intrinsics, &plain.intrinsics, 1e-5)?;
     }
 
-    /// Moving the world by M and the camera with it (viewmat M^-1) shows the same. Degree 0 of the
-    /// spherical harmonics: the higher ones are fixed to the axes of the world and would turn.
+    /// Moving the world by M, with the camera (viewmat M^-1), shows the same image. Only degree 0
+    /// of the spherical harmonics is used, as higher degrees are fixed to the world's axes and
+    /// would rotate.
     #[test]
     fn moving_world_and_camera_together_changes_nothing(
         scene in scenes(1..=8),
@@ -112,8 +112,8 @@ proptest! {
         all_close(&moved, &expected, 1e-11)?;
     }
 
-    /// A world, its Gaussians, the camera's place and the near and far planes k times as large show
-    /// the same; gradients by lengths are divided by k.
+    /// Scaling the world, its Gaussians, the camera's position and the near and far planes by k
+    /// shows the same image; gradients with respect to lengths are divided by k.
     #[test]
     fn scaling_everything_changes_nothing(scene in scenes(1..=8), log_factor in -7.0..7.0f64) {
         let factor = log_factor.exp();
@@ -139,8 +139,8 @@ proptest! {
     }
 }
 
-/// The product of a rotation and a quaternion (w, x, y, z). Linear and orthogonal in the second, so
-/// it moves gradients like quaternions.
+/// Product of a rotation and a quaternion (w, x, y, z). Linear and orthogonal in the second, so
+/// that it moves gradients like quaternions.
 fn times(turn: glam::DQuat, q: [f64; 4]) -> [f64; 4] {
     let product = turn * quat(q);
     [product.w, product.x, product.y, product.z]

@@ -1,9 +1,8 @@
-//! Properties that hold for every scene, on the CPU, checked on random ones (proptest, fixed
-//! seeds).
+//! Properties of every scene, on the CPU, tested on random ones (proptest, fixed seeds).
 //!
-//! - `invariance`: what may change without changing the picture, and how the gradients follow.
-//! - `blending`: what the rasteriser promises of colours, alpha and transmittance.
-//! - `differences`: the gradient of each op by central differences.
+//! - `invariance`: changes that leave the image unchanged, and their effect on the gradients.
+//! - `blending`: properties of the rasteriser's colours, alpha and transmittance.
+//! - `differences`: the gradient of each op, by central differences.
 #![cfg(feature = "cpu")]
 
 mod blending;

@@ -1,4 +1,4 @@
-//! Random scenes, and their pictures and gradients through the public ops.
+//! Random scenes, with their images and gradients through the public ops.
 
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use burn_splat::ops::{
@@ -18,7 +18,7 @@ pub const SIZE: ImageSize = ImageSize {
 };
 pub const PIXELS: usize = 40 * 24;
 
-/// Entries per Gaussian of coefficients of degree 3.
+/// Degree 3 coefficients per Gaussian.
 pub const COEFFS: usize = 16 * 3;
 
 /// N Gaussians and a camera.
@@ -43,7 +43,7 @@ pub struct Scene {
     pub far: f64,
 }
 
-/// The picture of a scene, and the gradients of a weighted sum over it, shaped as in [`Scene`].
+/// The image of a scene, and the gradients of a weighted sum over it, shaped as in [`Scene`].
 pub struct Outcome {
     pub image: Vec<f64>,
     pub alpha: Vec<f64>,
@@ -52,7 +52,7 @@ pub struct Outcome {
     pub scales: Vec<f64>,
     pub opacities: Vec<f64>,
     pub coeffs: Vec<f64>,
-    /// Rows.
+    /// Row-major.
     pub viewmat: Vec<f64>,
     pub intrinsics: Vec<f64>,
     pub background: Vec<f64>,
@@ -87,7 +87,7 @@ impl Scene {
         .expect("shapes fit")
     }
 
-    /// All three ops, forward and backward.
+    /// Runs all three ops, forward and backward.
     pub fn run(&self, dtype: DType) -> Outcome {
         let to = Upload { dtype };
         let n = self.len();
@@ -141,7 +141,7 @@ impl Scene {
     }
 }
 
-/// Tensors on the CPU, from values in double precision.
+/// Creates tensors on the CPU from values in double precision.
 #[derive(Clone, Copy)]
 pub struct Upload {
     pub dtype: DType,
@@ -165,7 +165,7 @@ pub fn host<const D: usize>(tensor: Tensor<D>) -> Vec<f64> {
     tensor.try_into_vec_as().expect("a float tensor")
 }
 
-/// A matrix in rows, as the ops take it.
+/// A matrix in row-major order, as in the ops.
 pub fn rows(matrix: DMat4) -> Vec<f64> {
     matrix.transpose().to_cols_array().to_vec()
 }
@@ -175,7 +175,7 @@ pub fn quat([w, x, y, z]: [f64; 4]) -> DQuat {
     DQuat::from_xyzw(x, y, z, w)
 }
 
-/// Any rotation, as a unit quaternion.
+/// A random rotation, as a unit quaternion.
 pub fn rotations() -> impl Strategy<Value = DQuat> {
     quats().prop_map(|q| quat(q).normalize())
 }
@@ -189,12 +189,12 @@ pub fn vectors(reach: f64) -> impl Strategy<Value = DVec3> {
     proptest::array::uniform3(-reach..reach).prop_map(DVec3::from_array)
 }
 
-/// One Gaussian, by where the camera sees it.
+/// A Gaussian, described by where the camera sees it.
 #[derive(Debug, Clone)]
 struct Seen {
-    /// From -1 to 1 across the picture.
+    /// Position in the image, from -1 to 1.
     at: [f64; 2],
-    /// Camera z is `1.5 + 0.4 (place in depth) + nudge`.
+    /// Camera z is `1.5 + 0.4 (depth rank) + nudge`.
     nudge: f64,
     quat: [f64; 4],
     scale: [f64; 3],
@@ -202,8 +202,8 @@ struct Seen {
     coeffs: Vec<f64>,
 }
 
-/// Some outside of the picture, some beyond the clamp, some above the cap of alpha, some below the
-/// cut; one to thirty pixels wide.
+/// Some outside the image, some beyond the clamp, some above the cap of alpha, some below the cut;
+/// one to thirty pixels wide.
 fn seen() -> impl Strategy<Value = Seen> {
     let at = prop_oneof![2 => -0.5..0.5, 1 => -2.0..2.0];
     let at = proptest::array::uniform2(at);
@@ -222,7 +222,7 @@ fn seen() -> impl Strategy<Value = Seen> {
     )
 }
 
-/// Thresholds of the rasteriser that pixels come by often, and the default ones.
+/// Thresholds of the rasteriser that many pixels meet, and the default ones.
 pub fn thresholds() -> impl Strategy<Value = RasterizeSettings> {
     let any = (0.002..0.05, 0.5..0.95, 0.005..0.1).prop_map(
         |(alpha_min, alpha_max, transmittance_min)| RasterizeSettings {
@@ -235,8 +235,8 @@ pub fn thresholds() -> impl Strategy<Value = RasterizeSettings> {
     prop_oneof![3 => any, 1 => Just(RasterizeSettings::default())]
 }
 
-/// Scenes of `count` Gaussians at depths at least 0.1 apart, in no order of depth, before a camera
-/// anywhere.
+/// Scenes of `count` Gaussians at depths at least 0.1 apart, in random order, in front of a random
+/// camera.
 pub fn scenes(count: core::ops::RangeInclusive<usize>) -> impl Strategy<Value = Scene> {
     count.prop_flat_map(|count| {
         (

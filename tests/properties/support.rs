@@ -3,7 +3,7 @@
 use proptest::prelude::*;
 use proptest::test_runner::RngSeed;
 
-/// The same cases in every run, and no files of past failures: a failure prints its shrunk scene.
+/// The same cases in every run, without files of past failures; a failure prints its shrunk scene.
 pub fn config(cases: u32) -> ProptestConfig {
     ProptestConfig {
         cases,
@@ -14,7 +14,8 @@ pub fn config(cases: u32) -> ProptestConfig {
     }
 }
 
-/// Weights of a loss `sum(weights * output)`: of both signs, none alike, and nothing to the scenes.
+/// Weights of a loss `sum(weights * output)`: of both signs, all different, and unrelated to the
+/// scenes.
 pub fn weights(count: usize) -> Vec<f64> {
     (0..count).map(|i| (1.7 * i as f64 + 0.3).sin()).collect()
 }
@@ -23,7 +24,7 @@ pub fn norm(values: &[f64]) -> f64 {
     values.iter().map(|v| v * v).sum::<f64>().sqrt()
 }
 
-/// `|a - b| <= tolerance |b|`. NaN fails.
+/// Checks `|a - b| <= tolerance |b|`. NaN fails.
 pub fn close(name: &str, a: &[f64], b: &[f64], tolerance: f64) -> Result<(), TestCaseError> {
     prop_assert_eq!(a.len(), b.len(), "lengths of {}", name);
     let difference: Vec<f64> = a.iter().zip(b).map(|(a, b)| a - b).collect();
@@ -35,7 +36,7 @@ pub fn close(name: &str, a: &[f64], b: &[f64], tolerance: f64) -> Result<(), Tes
     Ok(())
 }
 
-/// The very same bits.
+/// Checks for identical bits.
 pub fn identical(name: &str, a: &[f64], b: &[f64]) -> Result<(), TestCaseError> {
     prop_assert_eq!(a.len(), b.len(), "lengths of {}", name);
     for (i, (a, b)) in a.iter().zip(b).enumerate() {
@@ -47,7 +48,7 @@ pub fn identical(name: &str, a: &[f64], b: &[f64]) -> Result<(), TestCaseError> 
     Ok(())
 }
 
-/// Rows of `width` values, each as `map` makes it.
+/// Maps rows of `width` values.
 pub fn map_rows<const W: usize>(values: &[f64], map: impl Fn([f64; W]) -> [f64; W]) -> Vec<f64> {
     values
         .as_chunks::<W>()

@@ -1,16 +1,15 @@
-//! The program's allocator, which says in one line that there is no memory left. Without it the
-//! process aborts with a backtrace of nobody's interest.
+//! The program's allocator, which reports exhausted memory in one line. Without it the process
+//! aborts with a backtrace.
 
 use std::alloc::{GlobalAlloc, Layout};
 
-/// An allocator whose failure ends the process in words, with the exit status of what cannot be
-/// done.
+/// An allocator whose failure ends the process with a message and the exit status of bad input.
 pub struct OrSay<A>(pub A);
 
-// SAFETY: what the inner allocator promises; where it gives nothing, nothing is given.
+// SAFETY: as promised by the inner allocator; a failed allocation is never returned.
 unsafe impl<A: GlobalAlloc> GlobalAlloc for OrSay<A> {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        // SAFETY: the caller's promises are those that the inner allocator asks for.
+        // SAFETY: the caller's promises are those that the inner allocator requires.
         there(unsafe { self.0.alloc(layout) }, layout.size())
     }
 
@@ -30,7 +29,7 @@ unsafe impl<A: GlobalAlloc> GlobalAlloc for OrSay<A> {
     }
 }
 
-/// The memory, if it is there.
+/// Returns the memory, or ends the process if there is none.
 #[inline(always)]
 fn there(memory: *mut u8, size: usize) -> *mut u8 {
     if memory.is_null() {

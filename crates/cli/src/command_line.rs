@@ -1,10 +1,10 @@
-//! Commands that the program prints for the user to type, fit for a POSIX shell.
+//! Commands printed for the user to type, quoted for a POSIX shell.
 
 use std::path::Path;
 
 use super::GlobalArgs;
 
-/// A command of this program, built up argument by argument.
+/// A command of this program, built argument by argument.
 #[derive(Debug, Clone)]
 pub(super) struct CommandLine(String);
 
@@ -24,13 +24,13 @@ impl CommandLine {
         self
     }
 
-    /// Adds an option and the path it takes.
+    /// Adds an option with a path.
     pub(super) fn option(mut self, name: &str, path: &Path) -> Self {
         self.0 += &format!(" {name}");
         self.path(path)
     }
 
-    /// The command in one line; `None` where a path has line breaks or the like, which fit no line.
+    /// The command in one line; `None` if a path contains line breaks or other control characters.
     pub(super) fn in_a_line(&self) -> Option<&str> {
         (!self.0.contains(char::is_control)).then_some(&self.0)
     }
@@ -42,7 +42,7 @@ impl std::fmt::Display for CommandLine {
     }
 }
 
-/// A path as one word, which cannot be taken for an option.
+/// A path as one word, which cannot be mistaken for an option.
 fn quoted(path: &Path) -> String {
     let text = path.to_string_lossy();
     let text = match text.starts_with('-') {
@@ -51,7 +51,7 @@ fn quoted(path: &Path) -> String {
     };
     match shlex::try_quote(&text) {
         Ok(quoted) => quoted.into_owned(),
-        // A NUL, which no path holds.
+        // Contains NUL, which no path does.
         Err(_) => text,
     }
 }
@@ -60,7 +60,7 @@ fn quoted(path: &Path) -> String {
 mod tests {
     use super::*;
 
-    /// What a shell makes of the words is what they were.
+    /// The shell parses the words back to the originals.
     #[test]
     #[cfg(unix)]
     fn a_shell_gives_the_paths_back() {

@@ -1,4 +1,4 @@
-//! `--device`: which of Burn's devices to compute on.
+//! `--device`: selection of a Burn device.
 
 use burn::tensor::Device;
 use clap::ValueEnum;
@@ -6,7 +6,7 @@ use splat_ops::device::device_info;
 
 use super::{Failure, GlobalArgs};
 
-/// What `--device` takes.
+/// Values of `--device`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum DeviceChoice {
     /// A real GPU if there is one, else the CPU
@@ -24,7 +24,7 @@ pub enum DeviceChoice {
 }
 
 impl DeviceChoice {
-    /// As it is typed.
+    /// The value as typed.
     pub(super) fn argument(self) -> &'static str {
         match self {
             Self::Auto => "auto",
@@ -43,8 +43,8 @@ pub(super) struct ChosenDevice {
 }
 
 impl ChosenDevice {
-    /// Its name, and of a CubeCL device what decides which variants of the kernels run, and which
-    /// these are.
+    /// The name and, for a CubeCL device, the properties that select kernel variants, with the
+    /// variants selected.
     fn in_words(&self) -> String {
         let facts = device_info(&self.device).unwrap_or_default();
         let told = ["runtime", "planes", "atomic addition", "rasterize", "sort"];
@@ -54,7 +54,7 @@ impl ChosenDevice {
     }
 }
 
-/// Opens the device the user chose and says in a line which it is.
+/// Opens the chosen device and reports it in one line.
 pub(super) fn open(global: &GlobalArgs) -> Result<ChosenDevice, Failure> {
     let chosen = match global.device {
         DeviceChoice::Cpu => cpu(),
@@ -76,8 +76,7 @@ pub(super) fn open(global: &GlobalArgs) -> Result<ChosenDevice, Failure> {
     Ok(chosen)
 }
 
-/// Whether a device is known to crash in its driver, where nothing can be caught: all that helps is
-/// to say so before.
+/// True if a device is known to crash in its driver. That cannot be caught, only warned of.
 fn may_crash(facts: &[(&'static str, String)]) -> bool {
     let has = |name, part| {
         facts
@@ -100,8 +99,8 @@ fn cpu() -> Result<ChosenDevice, Failure> {
     Err(not_built("cpu"))
 }
 
-/// The first adapter that is a GPU. Software adapters (lavapipe, llvmpipe, WARP) call themselves a
-/// CPU and are left out: our own CPU path is many times faster.
+/// The first adapter that is a GPU. Software adapters (lavapipe, llvmpipe, WARP) report themselves
+/// as a CPU and are skipped; our own CPU path is many times faster.
 #[cfg(feature = "wgpu")]
 fn real_gpu() -> Option<ChosenDevice> {
     use burn::tensor::DeviceKind;
@@ -135,7 +134,7 @@ fn wgpu(_: &str) -> Result<ChosenDevice, Failure> {
     Err(not_built("wgpu"))
 }
 
-/// With the feature, wgpu compiles to SPIR-V wherever the adapter takes it.
+/// With this feature, wgpu compiles to SPIR-V if the adapter accepts it.
 #[cfg(feature = "vulkan")]
 fn vulkan() -> Result<ChosenDevice, Failure> {
     wgpu("vulkan")

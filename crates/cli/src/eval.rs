@@ -1,4 +1,4 @@
-//! `splat eval`: quality of a scene on a capture's views.
+//! `splat eval`: scores of a scene on a capture's views.
 
 use std::fmt::Write;
 use std::path::PathBuf;
@@ -36,7 +36,7 @@ pub struct EvalArgs {
     pub json: Option<PathBuf>,
 }
 
-/// What `--split` takes.
+/// Values of `--split`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum SplitChoice {
     /// Held-out views
@@ -74,7 +74,7 @@ pub(super) fn run(args: &EvalArgs, global: &GlobalArgs) -> Result<(), Failure> {
     Ok(())
 }
 
-/// The scores as text, one view a line, the means last.
+/// The scores as text, one view per line, the means last.
 pub(super) fn table(scores: &Scores) -> String {
     let names = scores.views.iter().map(|view| view.name.chars().count());
     let width = names.max().unwrap_or(0).max(4);

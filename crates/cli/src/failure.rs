@@ -1,16 +1,16 @@
-//! How a command ends when it does not succeed.
+//! Unsuccessful ends of a command.
 
 use std::fmt;
 use std::process::ExitCode;
 
 use splat_data::text::one_line;
 
-/// Why a command did not succeed. `Display` is the one line for the user.
+/// Why a command failed. `Display` is the one line for the user.
 #[derive(Debug)]
 pub enum Failure {
-    /// What the user gave cannot be used: exit status 2.
+    /// The user's input is unusable: exit status 2.
     BadInput(String),
-    /// A check ran and found something: exit status 1.
+    /// A check ran and failed: exit status 1.
     Check(String),
 }
 
@@ -23,7 +23,7 @@ impl Failure {
         }
     }
 
-    /// The line without what kind of failure it is.
+    /// The line without the kind of failure.
     pub(super) fn reason(self) -> String {
         match self {
             Self::BadInput(reason) | Self::Check(reason) => reason,
@@ -40,7 +40,7 @@ impl fmt::Display for Failure {
     }
 }
 
-/// The libraries' errors are about what they were given, and name it.
+/// Errors of the libraries concern their input and name it.
 impl<E: std::error::Error> From<E> for Failure {
     fn from(error: E) -> Self {
         Self::BadInput(one_line(&error.to_string()))

@@ -1,4 +1,4 @@
-//! `splat gradcheck`: every gradient against fixtures.
+//! `splat gradcheck`: every gradient, compared with fixtures.
 
 use std::path::PathBuf;
 
@@ -32,7 +32,7 @@ pub struct GradcheckArgs {
     pub json: Option<PathBuf>,
 }
 
-/// What `--precision` takes.
+/// Values of `--precision`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum Precision {
     /// 32-bit float
@@ -51,7 +51,7 @@ impl From<Precision> for gradcheck::Precision {
     }
 }
 
-/// What `--perturb` takes.
+/// Values of `--perturb`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Perturb {
     /// The direction of the spherical harmonics passes no gradient on

@@ -1,4 +1,4 @@
-//! `splat info`: what a scene or a capture is.
+//! `splat info`: contents of a scene or a capture.
 
 mod capture;
 mod histogram;
@@ -39,7 +39,7 @@ pub(super) fn run(args: &InfoArgs, _: &GlobalArgs) -> Result<(), Failure> {
     Ok(())
 }
 
-/// Least and greatest value of each axis; `[inf, -inf]` where there is no position.
+/// Smallest and largest value of each axis; `[inf, -inf]` if there are no positions.
 fn bounds(positions: impl Iterator<Item = [f64; 3]>) -> [[f64; 2]; 3] {
     positions.fold(
         [[f64::INFINITY, f64::NEG_INFINITY]; 3],
@@ -52,7 +52,7 @@ fn bounds(positions: impl Iterator<Item = [f64; 3]>) -> [[f64; 2]; 3] {
     )
 }
 
-/// Bounds as three lines, each axis on its own, with digits enough for an extent in any unit.
+/// Bounds as three lines, one per axis, with enough digits for an extent in any unit.
 fn bounds_text(bounds: [[f64; 2]; 3]) -> String {
     let line = |(axis, [least, most]): (&str, [f64; 2])| {
         let extent = most - least;

@@ -1,4 +1,4 @@
-//! Ctrl-C: the first finishes what is in hand, the second ends the program at once.
+//! Ctrl-C: the first finishes the current step, the second ends the program at once.
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};

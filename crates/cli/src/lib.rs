@@ -1,4 +1,4 @@
-//! The `splat` program: arguments, what is printed, exit status. One file per command.
+//! The `splat` program: arguments, output, exit status. One file per command.
 
 #[cfg(feature = "cpu")]
 mod bench;
@@ -88,7 +88,7 @@ pub fn main() -> ExitCode {
 }
 
 impl GlobalArgs {
-    /// Tells the user something that is no result.
+    /// Prints a message that is not a result.
     fn say(&self, line: impl std::fmt::Display) {
         if !self.quiet {
             tell(&line.to_string());
@@ -96,7 +96,7 @@ impl GlobalArgs {
     }
 }
 
-/// Prints results. That nobody reads them (a closed pipe) is no error; that they are lost is one.
+/// Prints results. A closed pipe is not an error; any other failure to print is.
 fn print(text: &str) -> Result<(), Failure> {
     let mut out = std::io::stdout().lock();
     let written = out.write_all(text.as_bytes()).and_then(|()| out.flush());

@@ -1,4 +1,4 @@
-//! How the photos of a capture are read: the same options for every command that reads one.
+//! Options for reading photos, shared by all commands that read a capture.
 
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
@@ -20,7 +20,7 @@ pub struct PhotoArgs {
 }
 
 impl PhotoArgs {
-    /// What was asked for, or the defaults.
+    /// The requested settings, or the defaults.
     pub(super) fn options(&self) -> CaptureSettings {
         let default = CaptureSettings::default();
         CaptureSettings {
@@ -29,7 +29,7 @@ impl PhotoArgs {
         }
     }
 
-    /// Reads a capture and says what is odd about it.
+    /// Reads a capture and prints its warnings.
     pub(super) fn open(&self, folder: &Path, global: &GlobalArgs) -> Result<Capture, Failure> {
         let capture = Capture::load(folder, &self.options())?;
         for warning in &capture.warnings {
@@ -38,7 +38,7 @@ impl PhotoArgs {
         Ok(capture)
     }
 
-    /// The words of a command line that give these options again; none where none was given.
+    /// Command-line words that repeat these options; empty if none were given.
     pub(super) fn words(&self) -> Vec<OsString> {
         let mut words: Vec<OsString> = Vec::new();
         if let Some(downscale) = self.downscale {
@@ -50,7 +50,7 @@ impl PhotoArgs {
         words
     }
 
-    /// Refuses options that would do nothing, where no capture is read.
+    /// Refuses options without effect if no capture is read.
     pub(super) fn refuse(&self, why: &str) -> Result<(), Failure> {
         match self.words().first() {
             Some(option) => Err(Failure::BadInput(format!(

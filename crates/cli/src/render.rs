@@ -46,7 +46,7 @@ pub struct RenderArgs {
     channels: Vec<Channel>,
 }
 
-/// Where the cameras come from: one of three.
+/// Source of the cameras: one of three.
 #[derive(Debug, Args)]
 #[group(required = true, multiple = false)]
 struct CameraArgs {
@@ -69,7 +69,7 @@ enum Channel {
 }
 
 impl Channel {
-    /// What the file's name has before `.png`.
+    /// Suffix of the file name before `.png`.
     fn suffix(self) -> &'static str {
         match self {
             Self::Rgb => "",
@@ -137,7 +137,7 @@ pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure>
     Ok(())
 }
 
-/// The picture of each channel asked for, from one camera.
+/// Picture of each requested channel, from one camera.
 fn pictures(
     gaussians: &Gaussians,
     camera: &CameraTensors,
@@ -163,8 +163,7 @@ fn pictures(
     Ok(pictures)
 }
 
-/// Accumulated depth `sum(z alpha T)`, `[1, H, W, 1]`: the depths rasterised as if they were a
-/// colour.
+/// Accumulated depth `sum(z alpha T)`, `[1, H, W, 1]`: depths rasterised like a colour.
 fn accumulated_depth(
     gaussians: &Gaussians,
     projected: &Projected,
@@ -181,7 +180,7 @@ fn accumulated_depth(
     Ok(rendered.image())
 }
 
-/// Mean depth of each pixel as a shade: nearest 1, farthest 0; 0 where there is little to see.
+/// Mean depth of each pixel as a shade: nearest 1, farthest 0; 0 where little is visible.
 fn depth_shades(depth: &[f32], alpha: &[f32]) -> Vec<f32> {
     const SEEN: f32 = 0.5;
     let mean = |(&depth, &alpha): (&f32, &f32)| (alpha >= SEEN).then(|| depth / alpha);
@@ -202,7 +201,7 @@ mod tests {
 
     #[test]
     fn near_is_bright_and_nothing_is_black() {
-        // Depths 2 and 4, and a pixel of which little is seen.
+        // Depths 2 and 4, and a pixel where little is visible.
         let shades = depth_shades(&[1.0, 4.0, 9.0, 3.0], &[0.5, 1.0, 0.1, 1.0]);
         assert_eq!(shades, [1.0, 0.0, 0.0, 0.5]);
         assert_eq!(depth_shades(&[1.0], &[0.0]), [0.0]);

@@ -1,4 +1,4 @@
-//! A scene file on a device, and how to render it.
+//! A scene file on a device, with its render settings.
 
 use std::path::Path;
 
@@ -9,7 +9,7 @@ use splat_model::{Gaussians, RenderSettings, ShPrecision};
 
 use super::{Failure, GlobalArgs, text};
 
-/// What `--sh-precision` takes.
+/// Values of `--sh-precision`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
 pub enum PrecisionChoice {
     /// Single precision
@@ -20,10 +20,9 @@ pub enum PrecisionChoice {
     Half,
 }
 
-/// Reads a scene, and how it must be rendered: as its file says. Files of earlier versions, and of
-/// other programs, do not say whether it was trained with anti-aliasing or in front of a
-/// background; of those, and only of those, the run's `config.toml` beside the file is asked, if
-/// there is one.
+/// Reads a scene and its render settings from its file. Files of earlier versions and of other
+/// programs do not say whether the scene was trained with anti-aliasing or a background; only for
+/// those, the run's `config.toml` beside the file is read, if there is one.
 pub(super) fn open(
     path: &Path,
     device: &Device,
@@ -48,8 +47,8 @@ pub(super) fn open(
     Ok((gaussians, RenderSettings::of_scene(&data)))
 }
 
-/// Takes what the scene does not say from the `config.toml` beside it. One that is not a run's is
-/// passed over.
+/// Reads missing settings from the `config.toml` beside the scene. A file that does not belong to a
+/// run is ignored.
 fn ask_config(scene: &Path, settings: &mut SceneSettings, global: &GlobalArgs) {
     let path = scene.with_file_name("config.toml");
     let says_all = settings.antialias.is_some() && settings.background.is_some();

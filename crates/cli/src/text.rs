@@ -6,8 +6,7 @@ use super::Failure;
 use splat_data::text::utf8;
 use splat_trainer::TrainSettings;
 
-/// Reads a file and what `parse` makes of its text, without a byte-order mark; errors name the
-/// file.
+/// Reads a file and parses its text, without a byte-order mark; errors name the file.
 pub(super) fn read<T>(
     path: &Path,
     parse: impl FnOnce(&str) -> Result<T, String>,

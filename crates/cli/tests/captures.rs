@@ -1,5 +1,5 @@
-//! Captures as the `splat` program meets them: photos in a folder of another name, and views whose
-//! pictures would share one.
+//! Captures with unusual layouts: photos in a folder of another name, and views whose pictures
+//! would share a name.
 #![cfg(feature = "cpu")]
 
 use std::collections::BTreeSet;
@@ -22,7 +22,7 @@ fn text(path: &Path) -> &str {
     path.to_str().unwrap()
 }
 
-/// What the program says while it does what it was asked for.
+/// The program's messages on success.
 fn said(arguments: &[&str]) -> String {
     let output = splat(arguments);
     let said = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -30,7 +30,7 @@ fn said(arguments: &[&str]) -> String {
     said
 }
 
-/// What it says when it refuses, in one line and with exit status 2.
+/// The program's error: one line, with exit status 2.
 fn refusal(arguments: &[&str]) -> String {
     let output = splat(&[&["--quiet"], arguments].concat());
     let line = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -39,7 +39,7 @@ fn refusal(arguments: &[&str]) -> String {
     line
 }
 
-/// The example at an eighth of its size, its held-out views called `names`.
+/// The example at an eighth of its size, with held-out views called `names`.
 fn small_example(into: &Path, names: [&str; 4]) -> PathBuf {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
     let options = CaptureSettings {
@@ -80,7 +80,7 @@ fn every_view_gets_its_picture() {
         files(&out.join("views"))
     );
 
-    // Of all views, and two files of each.
+    // All views, with two files each.
     let pictures = folder.path().join("pictures");
     let scene = out.join("scene.ply");
     let arguments = [
@@ -151,7 +151,7 @@ fn photos_may_lie_in_a_folder_of_another_name() {
     let photo = image::image_dimensions(photo).unwrap();
     assert_eq!((width, height), (photo.0 / 2, photo.1 / 2));
 
-    // Where no photo is read the option is a mistake.
+    // The option is an error where no photo is read.
     for command in [
         &["info", scene][..],
         &[&render[..], &["--orbit", "1"]].concat(),
@@ -161,7 +161,7 @@ fn photos_may_lie_in_a_folder_of_another_name() {
     }
 }
 
-/// Neither by pictures of all views nor by those of the held-out ones.
+/// Neither pictures of all views nor those of the held-out ones may replace a photo.
 #[test]
 fn no_photo_is_replaced_by_a_picture() {
     let folder = TempDir::new().unwrap();

@@ -1,5 +1,5 @@
-//! What memory cannot hold is refused in one line; an allocation that failed would end the process
-//! without a word.
+//! Work that does not fit into memory is refused in one line; a failed allocation would end the
+//! process without a message.
 #![cfg(all(feature = "cpu", target_os = "linux"))]
 
 use std::path::Path;
@@ -8,10 +8,10 @@ use std::process::{Command, Output};
 use splat_data::SplatData;
 use splat_data::scene::ply;
 
-/// Limit of the address space in kB, as `ulimit -v` takes it: 1.5 GB.
+/// Limit of the address space in kB, for `ulimit -v`: 1.5 GB.
 const LIMIT: &str = "1500000";
 
-/// Gaussians that each fill any picture, hardly visible, so that no pixel stops.
+/// Gaussians that each fill the whole picture, barely visible, so that no pixel stops.
 fn haze(count: usize) -> SplatData {
     SplatData {
         means: (0..count)

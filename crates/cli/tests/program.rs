@@ -1,5 +1,5 @@
-//! The `splat` program as its users meet it: what it leaves, that it repeats itself, and what it
-//! says to bad input.
+//! The `splat` program from a user's view: its results, their reproducibility, and its messages for
+//! bad input.
 #![cfg(feature = "cpu")]
 
 #[path = "program/runs.rs"]
@@ -12,7 +12,7 @@ use std::process::{Command, Output};
 
 use tempfile::TempDir;
 
-/// The example capture, in its own folder so that a test may spoil it.
+/// The example capture, copied so that a test may corrupt it.
 fn example(into: &Path) -> PathBuf {
     let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
     let target = into.join("capture");
@@ -66,8 +66,7 @@ fn training_leaves_everything_and_repeats_itself_bit_for_bit() {
     let folder = TempDir::new().unwrap();
     let capture = example(folder.path());
     let outs = ["a", "b", "other_seed"].map(|name| folder.path().join(name));
-    // 300 steps reach the first refinement, so cloning, splitting and pruning are in the
-    // comparison.
+    // 300 steps include the first refinement, so that cloning, splitting and pruning are compared.
     succeed(&train(
         &capture,
         &outs[0],
@@ -95,7 +94,7 @@ fn training_leaves_everything_and_repeats_itself_bit_for_bit() {
     let metrics = metrics(&outs[0]);
     assert_eq!(metrics["views"].as_array().unwrap().len(), 4);
     assert_eq!(metrics["steps"], 300);
-    // It learns: far better on held-out views than what it began with.
+    // It learns: far better on held-out views than at the start.
     let begun = folder.path().join("begun");
     succeed(&train(&capture, &begun, &["--steps", "1", "--seed", "7"]));
     let begun = self::metrics(&begun)["psnr"].as_f64().unwrap();
@@ -114,7 +113,7 @@ fn training_leaves_everything_and_repeats_itself_bit_for_bit() {
     succeed(&splat(&["info", text(&capture)]));
 }
 
-/// Bad input: exit status 2, one line that holds these words, and no output folder.
+/// Bad input: exit status 2, one line that contains these words, and no output folder.
 fn refused(output: &Output, out: &Path, words: &[&str]) {
     let errors = String::from_utf8_lossy(&output.stderr).into_owned();
     assert_eq!(output.status.code(), Some(2), "{errors}");
@@ -157,7 +156,7 @@ fn bad_captures_are_refused_in_one_line() {
     );
     fs::write(&points, kept).unwrap();
 
-    // At 1 x 1 pixel there is nothing to compare.
+    // At 1 x 1 pixel nothing can be compared.
     let tiny = splat(&[
         "train",
         text(&capture),
@@ -302,7 +301,7 @@ fn benches_of_speed_measure_a_device_too() {
     for rate in ["forward", "backward", "backward_unordered"] {
         assert!(row[rate]["tested_per_second"].as_f64().unwrap() > 0.0);
     }
-    // Of one pass: the ratio is that of its two times.
+    // For one pass, the ratio is that of its two times.
     let [ordered, unordered] = ["backward", "backward_unordered"]
         .map(|name| row[name]["milliseconds"]["median"].as_f64().unwrap());
     let ratio = median("cost_of_order") * unordered / ordered;
@@ -347,7 +346,7 @@ fn benches_refuse_what_they_cannot_measure_in_one_line() {
     }
 }
 
-/// As behind `splat ... 2>&1 | head -1`.
+/// As in `splat ... 2>&1 | head -1`.
 #[test]
 fn that_nobody_reads_what_is_said_ends_nothing() {
     let fixture = concat!(

@@ -1,5 +1,5 @@
-//! Checkpoints: safetensors with a model, its moments and what the strategy keeps, and what is
-//! known of the run as JSON in the metadata.
+//! Checkpoints: safetensors with a model, its moments and the strategy's state, and JSON about the
+//! run in the metadata.
 
 use std::path::Path;
 use std::sync::{Arc, Mutex};
@@ -74,7 +74,7 @@ fn mutate(input: &mut Input, rng: &mut Pcg64Mcg) {
         Some(changed) => *bytes = changed,
         None => file::mutate(bytes, rng),
     }
-    // Most with the checksum of what they are now, or nothing would be looked at but that.
+    // Mostly with a correct checksum, or nothing else would be tested.
     if rng.random_bool(0.95) {
         seal(bytes);
     }
@@ -89,7 +89,7 @@ fn seal(bytes: &mut Vec<u8>) {
     }
 }
 
-/// Changes what is known of the run.
+/// Mutates the JSON about the run.
 fn meta(bytes: &[u8], rng: &mut Pcg64Mcg) -> Option<Vec<u8>> {
     let (mut header, data) = file::parts(bytes)?;
     let text = header.get("__metadata__")?.get(META)?.as_str()?;
@@ -99,7 +99,7 @@ fn meta(bytes: &[u8], rng: &mut Pcg64Mcg) -> Option<Vec<u8>> {
     Some(file::joined(&header, &data))
 }
 
-/// Reads a checkpoint; what is let through goes on for some steps.
+/// Reads a checkpoint; an accepted one is resumed for some steps.
 fn parse(input: &Input) -> Result<Follow, String> {
     let checkpoint = Checkpoint::parse(Path::new("checkpoint.safetensors"), &input.0[0]);
     let checkpoint = checkpoint.map_err(|error| error.to_string())?;

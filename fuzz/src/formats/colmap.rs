@@ -11,7 +11,7 @@ type Image = (u32, [f64; 4], [f64; 3], u32, String, Vec<(f64, f64, i64)>);
 /// A point: id, position, colour, track (image, keypoint).
 type Point = (u64, [f64; 3], [u8; 3], Vec<(u32, u32)>);
 
-/// What the three files hold.
+/// Contents of the three files.
 pub(super) struct Model {
     cameras: Vec<Camera>,
     images: Vec<Image>,
@@ -19,7 +19,7 @@ pub(super) struct Model {
 }
 
 impl Model {
-    /// Two cameras, one of each kind that can be read; five images; six points.
+    /// Two cameras, one of each supported model; five images; six points.
     pub(super) fn small() -> Self {
         let keypoints = |i: u32| {
             let keypoint = |k: u32| (f64::from(k) + 1.5, 2.5, i64::from(k) - 1);

@@ -1,4 +1,4 @@
-//! COLMAP's binary model: three files of records behind a count.
+//! COLMAP's binary model: three files of records after a count.
 
 use std::ops::Range;
 use std::sync::Arc;
@@ -26,7 +26,7 @@ fn seeds() -> Vec<Input> {
     vec![Model::small().binary()]
 }
 
-/// Parses a model; what is let through is trained on for a step.
+/// Parses a model; an accepted one is trained for a step.
 pub(super) fn parse(binary: bool, input: &Input) -> Result<Follow, String> {
     let files = [0, 1, 2].map(|part| input.0[part].as_slice());
     let capture = parse_capture(binary, files).map_err(|error| error.to_string())?;
@@ -51,7 +51,7 @@ fn mutate(input: &mut Input, rng: &mut Pcg64Mcg) {
     let count = u64::from_le_bytes(bytes[..8].try_into().expect("eight bytes"));
     let set_count = |bytes: &mut [u8], count: u64| bytes[..8].copy_from_slice(&count.to_le_bytes());
     match rng.random_range(0..8) {
-        // A record goes, or comes again, with or without the count.
+        // Removes or repeats a record, with or without adjusting the count.
         0 => {
             bytes.drain(a);
             set_count(bytes, count.wrapping_sub(rng.random_range(0..=1)));
@@ -130,7 +130,7 @@ fn name(part: usize, bytes: &mut Vec<u8>, record: Range<usize>, rng: &mut Pcg64M
     bytes.splice(start..end, new);
 }
 
-/// Where the records of a file lie, as far as they make sense.
+/// Ranges of a file's records, as far as they make sense.
 fn records(part: usize, bytes: &[u8]) -> Vec<Range<usize>> {
     let count = |at: usize| -> Option<usize> {
         let bytes = bytes.get(at..at + 8)?;

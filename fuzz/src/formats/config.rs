@@ -70,10 +70,10 @@ fn seeds() -> Vec<Input> {
     texts.map(|text| Input(vec![text.into_bytes()])).to_vec()
 }
 
-/// Reads settings; what is let through begins a run.
+/// Reads settings; accepted ones start a run.
 fn parse(input: &Input) -> Result<Follow, String> {
     let config = TrainSettings::parse(&input.0[0]);
-    // As the program says it, with the file before it.
+    // As the program reports it, with the file in front.
     let config = config.map_err(|reason| format!("config.toml: {reason}"))?;
     Ok(Box::new(move || train_steps(capture(), config, None)))
 }

@@ -1,4 +1,4 @@
-//! Gradient fixtures: safetensors with a scene, its pictures and its gradients.
+//! Gradient fixtures: safetensors with a scene, its images and its gradients.
 
 use std::path::Path;
 
@@ -54,8 +54,8 @@ fn seeds() -> Vec<Input> {
     vec![one, two, none]
 }
 
-/// N Gaussians in front of one camera, or of C, and a picture of 5 x 4 pixels. The gradients are
-/// any numbers.
+/// N Gaussians in front of one camera, or of C, and an image of 5 x 4 pixels. The gradients are
+/// arbitrary.
 fn fixture(
     n: usize,
     c: Option<usize>,
@@ -130,7 +130,7 @@ fn mutate(input: &mut Input, rng: &mut Pcg64Mcg) {
     *bytes = file::joined(&header, &data);
 }
 
-/// Reads a fixture; what is let through is checked, where it is small.
+/// Reads a fixture; an accepted one is checked if it is small.
 fn parse(input: &Input) -> Result<Follow, String> {
     let fixture = Fixture::parse(Path::new("fixture.safetensors"), &input.0[0]);
     let fixture = fixture.map_err(|error| error.to_string())?;

@@ -1,4 +1,4 @@
-//! Gaussians in Burn's own file format.
+//! Gaussians in Burn's file format.
 
 use std::path::Path;
 
@@ -17,8 +17,8 @@ pub(super) const TARGET: Target = Target {
     mutate,
     parse,
     follow_every: 64,
-    // The library makes room for up to a MiB of entries that a header announces before it finds
-    // that the file ends.
+    // The library allocates up to a MiB of entries announced by a header before it notices that the
+    // file ends.
     memory: Memory {
         per_byte: 32,
         constant: (2 << 20) + (8 << 10),
@@ -43,7 +43,7 @@ fn mutate(input: &mut Input, rng: &mut Pcg64Mcg) {
     mutate::bytes(&mut input.0[0], rng);
 }
 
-/// Reads a model; what is let through is rendered.
+/// Reads a model; an accepted one is rendered.
 fn parse(input: &Input) -> Result<Follow, String> {
     let path = Path::new("gaussians.bpk");
     let gaussians = Gaussians::parse(path, input.0[0].clone(), &Device::flex());

@@ -1,4 +1,4 @@
-//! One file per format: valid files to start from, mutations that know the format, and what is run.
+//! One file per format: valid seeds, format-aware mutations, and the code under test.
 
 mod checkpoint;
 mod colmap;
@@ -18,42 +18,43 @@ use splat_data::Capture;
 use splat_trainer::Checkpoint;
 use splat_trainer::{TrainSettings, Trainer};
 
-/// What is run: the content of one file, or of several that belong together.
+/// An input: the contents of one file, or of several that belong together.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
 pub struct Input(pub Vec<Vec<u8>>);
 
-/// What the program would do with what a reader let through; whether it does.
+/// The program's next stage for an accepted input; returns true if it succeeds.
 pub type Follow = Box<dyn FnOnce() -> bool>;
 
 /// A reader to fuzz.
 pub struct Target {
     /// Its name.
     pub name: &'static str,
-    /// What every message must contain: the name of the file, or what its files have in common.
+    /// Text that every message must contain: the file's name, or the common part of its files'
+    /// names.
     pub file: &'static str,
-    /// Valid inputs, small.
+    /// Small valid inputs.
     pub seeds: fn() -> Vec<Input>,
-    /// Changes an input as its format suggests.
+    /// Mutates an input with knowledge of its format.
     pub mutate: fn(&mut Input, &mut Pcg64Mcg),
-    /// Runs the reader: the message of what it refuses, or what comes next.
+    /// Runs the reader: returns the message of a refusal, or the next stage.
     pub parse: fn(&Input) -> Result<Follow, String>,
-    /// Of what is let through, one in so many is handed on.
+    /// One in this many accepted inputs is passed on.
     pub follow_every: u64,
-    /// What the reader may take.
+    /// Memory that the reader may use.
     pub memory: Memory,
 }
 
-/// A bound of memory: so many bytes for each of the input, and so many in any case.
+/// A bound on memory: bytes per input byte, and a constant.
 #[derive(Debug, Clone, Copy)]
 pub struct Memory {
-    /// Times the input's length. The input itself, which is in memory already, does not count.
+    /// Factor of the input's length. The input itself, already in memory, does not count.
     pub per_byte: usize,
-    /// Bytes in any case.
+    /// Constant bytes.
     pub constant: usize,
 }
 
-/// Every reader. The bounds of memory are stated here and nowhere else. That of TOML is the
-/// library's: every `{a=` begins a table.
+/// All readers. The bounds of memory are stated only here. That of TOML is the library's: every
+/// `{a=` begins a table.
 ///
 /// | reader | bytes for each of the file | and |
 /// |---|---|---|
@@ -73,7 +74,7 @@ pub static TARGETS: [Target; 7] = [
     gaussians::TARGET,
 ];
 
-/// A bound of so much for each byte and 8 KiB.
+/// A bound of this many bytes per input byte, plus 8 KiB.
 const fn per_byte(per_byte: usize) -> Memory {
     Memory {
         per_byte,
@@ -81,7 +82,7 @@ const fn per_byte(per_byte: usize) -> Memory {
     }
 }
 
-/// A capture to train on: that of the COLMAP seeds.
+/// A capture for training: that of the COLMAP seeds.
 fn capture() -> Arc<Capture> {
     static CAPTURE: LazyLock<Arc<Capture>> = LazyLock::new(|| {
         let files = colmap::Model::small().binary();
@@ -92,7 +93,7 @@ fn capture() -> Arc<Capture> {
     CAPTURE.clone()
 }
 
-/// Takes some steps of a run, and says whether it could: refusing is fine.
+/// Takes some steps of a run; returns true if it could. A refusal is fine.
 fn train_steps(
     capture: Arc<Capture>,
     config: TrainSettings,
@@ -107,12 +108,12 @@ fn train_steps(
     let Ok(mut trainer) = trainer.build() else {
         return false;
     };
-    // The third may already add and remove Gaussians.
+    // The third step may already add and remove Gaussians.
     let few = |trainer: &Trainer| trainer.model().len() < 1_000;
     (0..3).all(|_| !few(&trainer) || trainer.step().is_ok())
 }
 
-/// Replaces a value somewhere in a JSON text by an odd one, or drops, repeats or renames an entry.
+/// Replaces a random value in a JSON text by an odd one, or drops, repeats or renames an entry.
 fn mutate_json(value: &mut serde_json::Value, rng: &mut Pcg64Mcg) {
     use rand::RngExt;
     use serde_json::{Value, json};

@@ -1,4 +1,4 @@
-//! Scenes as PLY: a header of text, and rows of text or numbers.
+//! Scenes as PLY: a text header, and rows of text or numbers.
 
 use std::path::Path;
 
@@ -19,7 +19,7 @@ pub(super) const TARGET: Target = Target {
     mutate,
     parse,
     follow_every: 64,
-    // The PLY library makes room for up to 65,536 entries of a list, 8 bytes each, before it finds
+    // The PLY library allocates up to 65,536 entries of a list, 8 bytes each, before it notices
     // that the file ends.
     memory: Memory {
         per_byte: 32,
@@ -90,14 +90,14 @@ fn seeds() -> Vec<Input> {
     seeds.map(|seed| Input(vec![seed])).to_vec()
 }
 
-/// Behind the header's last line.
+/// Position after the header's last line.
 fn body(file: &[u8]) -> usize {
     const END: &[u8] = b"end_header\n";
     let found = file.windows(END.len()).position(|window| window == END);
     found.map_or(file.len(), |at| at + END.len())
 }
 
-/// The same scene of floats, as text, with another element before it and a list behind each row.
+/// The same scene of floats as text, with another element before it and a list after each row.
 fn ascii(file: &[u8]) -> Vec<u8> {
     let (header, rows) = file.split_at(body(file));
     let header = String::from_utf8_lossy(header)
@@ -143,7 +143,7 @@ fn mutate(input: &mut Input, rng: &mut Pcg64Mcg) {
     file.extend(rest);
 }
 
-/// Reads a scene; what is let through is rendered.
+/// Reads a scene; an accepted one is rendered.
 fn parse(input: &Input) -> Result<Follow, String> {
     let scene = ply::parse(Path::new("scene.ply"), &input.0[0]);
     let scene = scene.map_err(|error| error.to_string())?;
@@ -155,7 +155,7 @@ fn parse(input: &Input) -> Result<Follow, String> {
     }))
 }
 
-/// Whether a picture comes of it.
+/// True if rendering yields an image.
 pub(super) fn renders(gaussians: &Gaussians) -> bool {
     let view = &capture().views[0];
     let camera = view.camera().relative_to(gaussians.origin);

@@ -1,5 +1,4 @@
-//! Safetensors files, of which fixtures and checkpoints are some: a length, a header in JSON, and
-//! data.
+//! Safetensors files, including fixtures and checkpoints: a length, a JSON header, and data.
 
 use rand::RngExt;
 use rand_pcg::Pcg64Mcg;
@@ -8,7 +7,7 @@ use serde_json::{Value, json};
 use super::mutate_json;
 use crate::mutate::{self, WORDS, number, one_of, place};
 
-/// Writes tensors of singles or doubles with metadata.
+/// Writes tensors of f32 or f64 with metadata.
 pub(super) fn written(
     tensors: &[(String, safetensors::Dtype, Vec<usize>, Vec<u8>)],
     metadata: &[(&str, &str)],
@@ -22,7 +21,7 @@ pub(super) fn written(
     safetensors::serialize(views, Some(metadata)).expect("a valid file")
 }
 
-/// The header and the data, where they can be told apart.
+/// Header and data, if they can be told apart.
 pub(super) fn parts(file: &[u8]) -> Option<(Value, Vec<u8>)> {
     let (length, rest) = file.split_first_chunk::<8>()?;
     let length = usize::try_from(u64::from_le_bytes(*length)).ok()?;
@@ -30,14 +29,14 @@ pub(super) fn parts(file: &[u8]) -> Option<(Value, Vec<u8>)> {
     Some((header, rest[length..].to_vec()))
 }
 
-/// Puts a header before data.
+/// Joins a header and data.
 pub(super) fn joined(header: &Value, data: &[u8]) -> Vec<u8> {
     let header = header.to_string();
     let length = (header.len() as u64).to_le_bytes();
     [&length[..], header.as_bytes(), data].concat()
 }
 
-/// Changes a file by its tensors, its metadata, or its data.
+/// Mutates a file's tensors, metadata or data.
 pub(super) fn mutate(file: &mut Vec<u8>, rng: &mut Pcg64Mcg) {
     let Some((mut header, mut data)) = parts(file) else {
         mutate::bytes(file, rng);
@@ -58,7 +57,7 @@ pub(super) fn mutate(file: &mut Vec<u8>, rng: &mut Pcg64Mcg) {
     *file = joined(&header, &data);
 }
 
-/// Takes a tensor out, with its data, so that the file is valid but for what is missing.
+/// Removes a tensor with its data, so that the file is valid except for the missing tensor.
 fn drop_tensor(header: &mut Value, data: &mut Vec<u8>, rng: &mut Pcg64Mcg) {
     let Some(map) = header.as_object_mut().filter(|map| !map.is_empty()) else {
         return;
@@ -89,7 +88,7 @@ fn drop_tensor(header: &mut Value, data: &mut Vec<u8>, rng: &mut Pcg64Mcg) {
     }
 }
 
-/// Changes a tensor's shape or type, without or with regard to its size, or its name or place.
+/// Changes a tensor's shape or type, with or without regard to its size, or its name or position.
 fn tensor(header: &mut Value, rng: &mut Pcg64Mcg) {
     let Some(map) = header.as_object_mut() else {
         return;
@@ -114,7 +113,7 @@ fn tensor(header: &mut Value, rng: &mut Pcg64Mcg) {
             ))
         }
         1 => {
-            // As many elements, in other dimensions.
+            // The same number of elements, in other dimensions.
             if let Some(shape) = entry["shape"].as_array_mut() {
                 let a = place(rng, shape.len());
                 match rng.random_range(0..3) {
@@ -142,7 +141,7 @@ fn tensor(header: &mut Value, rng: &mut Pcg64Mcg) {
             }
         }
         4 => {
-            // Two tensors change names.
+            // Two tensors swap names.
             let other = one_of(rng, &tensors).clone();
             let (a, b) = (map[&name].clone(), map[&other].clone());
             map.insert(name, b);
@@ -153,7 +152,7 @@ fn tensor(header: &mut Value, rng: &mut Pcg64Mcg) {
             map.insert(format!("{name}{}", one_of(rng, &WORDS)), entry);
         }
         _ => {
-            // Singles read as doubles, and back: as many bytes.
+            // f32 read as f64, or the reverse, with the same number of bytes.
             let wide = entry["dtype"] == json!("F64");
             entry["dtype"] = json!(if wide { "F32" } else { "F64" });
             if let Some(last) = entry["shape"]

@@ -1,4 +1,4 @@
-//! `splat bench accuracy`: error beside speed.
+//! `splat bench accuracy`: error and speed.
 
 use std::path::PathBuf;
 
@@ -60,7 +60,7 @@ pub(super) fn run(args: &AccuracyArgs, global: &GlobalArgs) -> Result<(), Failur
     Ok(())
 }
 
-/// The chosen device; or, where none was chosen, all there are.
+/// The chosen device, or all available ones.
 fn backends(global: &GlobalArgs) -> Result<Vec<Backend>, Failure> {
     let one = |choice: DeviceChoice| -> Result<Backend, Failure> {
         let chosen = device::open(&GlobalArgs {

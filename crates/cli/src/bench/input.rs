@@ -1,4 +1,4 @@
-//! What a bench of speed measures on: a capture.
+//! Input of the speed benches: a capture.
 
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -10,15 +10,15 @@ use crate::photos::PhotoArgs;
 use splat_data::Capture;
 use splat_trainer::TrainSettings;
 
-/// The capture that the project carries.
+/// The capture shipped with the project.
 pub(super) const EXAMPLE: &str = "examples/data/saharov";
 
-/// The capture, and how long to measure.
+/// The capture, and the time to measure.
 #[derive(Debug, Clone, Args)]
 pub(super) struct CaptureArgs {
     #[command(flatten)]
     pub(super) photos: PhotoArgs,
-    /// Measure each setting for about so long; once through it in any case
+    /// Measure each setting for about this many seconds, and at least once
     #[arg(long, value_name = "S", default_value_t = 10.0)]
     pub(super) seconds: f64,
 }
@@ -36,7 +36,7 @@ impl CaptureArgs {
         Ok(Arc::new(capture))
     }
 
-    /// The usual settings, but for what was asked for.
+    /// The default settings, with the requested changes.
     pub(super) fn config(&self, global: &GlobalArgs) -> TrainSettings {
         TrainSettings {
             downscale: self.photos.options().downscale,
@@ -45,7 +45,7 @@ impl CaptureArgs {
         }
     }
 
-    /// As they are typed, with a space before each.
+    /// The options as typed, each with a leading space.
     pub(super) fn typed(&self) -> String {
         let words = self.photos.words();
         let words = words.iter().map(|word| format!(" {}", word.display()));

@@ -1,4 +1,4 @@
-//! `splat bench`: errors, speed and how it grows, on the CPU or a CubeCL device.
+//! `splat bench`: errors, speed and growth, on the CPU or a CubeCL device.
 
 mod accuracy;
 mod input;
@@ -29,7 +29,7 @@ pub struct BenchArgs {
     bench: Bench,
 }
 
-/// What `splat bench` measures.
+/// Subcommands of `splat bench`.
 #[derive(Debug, Subcommand)]
 enum Bench {
     Accuracy(accuracy::AccuracyArgs),
@@ -54,7 +54,7 @@ pub(super) fn run(args: &BenchArgs, global: &GlobalArgs) -> Result<(), Failure> 
     }
 }
 
-/// Tries whether the files of a report can be written, before the long work.
+/// Checks that the files of a report can be written, before the long work.
 fn probe_report(folder: &Option<PathBuf>, names: &[&str]) -> Result<(), WriteError> {
     let Some(folder) = folder else { return Ok(()) };
     names
@@ -76,7 +76,7 @@ fn write_svg(path: &Path, svg: Result<String, String>) -> Result<(), Failure> {
     Ok(written.map_err(|source| WriteError { path, source })?)
 }
 
-/// What the benches of speed measure on: the CPU unless another device is asked for by name.
+/// Device of the speed benches: the CPU, unless another is named.
 fn chosen(global: &GlobalArgs) -> Result<Device, Failure> {
     match global.device {
         DeviceChoice::Auto | DeviceChoice::Cpu => Ok(Device::flex()),
@@ -86,8 +86,7 @@ fn chosen(global: &GlobalArgs) -> Result<Device, Failure> {
     }
 }
 
-/// The page of all benches of speed is about the CPU: another device is not what the user would get
-/// figures for.
+/// Refuses other devices: the page of all speed benches is about the CPU.
 fn cpu_only(global: &GlobalArgs) -> Result<(), Failure> {
     match global.device {
         DeviceChoice::Auto | DeviceChoice::Cpu => Ok(()),

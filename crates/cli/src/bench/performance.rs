@@ -1,4 +1,4 @@
-//! `splat bench performance`: all of the benches of speed, and the page of them.
+//! `splat bench performance`: all speed benches, and their page.
 
 use std::path::PathBuf;
 
@@ -20,7 +20,7 @@ const PAGE: &str = "PERFORMANCE.md";
 const STEP_SVG: &str = "performance_step.svg";
 const SCALING_SVG: &str = "performance_scaling.svg";
 
-/// All of step, rasterize and scaling, and the page PERFORMANCE.md of them
+/// All of step, rasterize and scaling, and their page PERFORMANCE.md
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   splat bench performance --report docs
@@ -30,7 +30,7 @@ pub(super) struct PerformanceArgs {
     capture: Option<PathBuf>,
     #[command(flatten)]
     input: CaptureArgs,
-    /// Scene whose lists the rasteriser works on: a PLY file [default: the capture's first
+    /// Scene whose lists the rasteriser works on: a PLY file [default: the capture's initial
     /// Gaussians]
     #[arg(long, value_name = "FILE")]
     scene: Option<PathBuf>,

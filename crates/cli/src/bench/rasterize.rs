@@ -24,9 +24,10 @@ use splat_trainer::Trainer;
 
 Measures the CPU unless --device names another.")]
 pub(super) struct RasterizeArgs {
-    /// Capture, whose first Gaussians are rendered, or a scene.ply [default: examples/data/saharov]
+    /// Capture, whose initial Gaussians are rendered, or a scene.ply [default:
+    /// examples/data/saharov]
     scene: Option<PathBuf>,
-    /// Capture whose views are rendered, where a scene.ply was given
+    /// Capture whose views are rendered, if a scene.ply is given
     #[arg(long, value_name = "DIR")]
     capture: Option<PathBuf>,
     #[command(flatten)]
@@ -64,7 +65,7 @@ pub(super) fn run(args: &RasterizeArgs, global: &GlobalArgs) -> Result<(), Failu
     Ok(())
 }
 
-/// Measures a scene, or the first Gaussians of the capture, in the capture's views.
+/// Measures a scene, or the initial Gaussians of the capture, in the capture's views.
 pub(super) fn report(
     ply: Option<&Path>,
     capture: Option<&Path>,

@@ -1,4 +1,4 @@
-//! `splat bench scaling`: how time and memory grow.
+//! `splat bench scaling`: growth of time and memory.
 
 use std::path::PathBuf;
 use std::process::Command;
@@ -66,7 +66,7 @@ pub(super) struct SyntheticArgs {
 /// Writes a synthetic capture.
 pub(super) fn run_synthetic(args: &SyntheticArgs) -> Result<(), Failure> {
     check_gaussians("GAUSSIANS", &[args.gaussians])?;
-    // The photos take long to render.
+    // Checked first, since rendering the photos takes long.
     let model = args.out.join("sparse");
     if model.exists() {
         return Err(Failure::BadInput(format!(
@@ -109,7 +109,7 @@ pub(super) fn run_point(args: &PointArgs, global: &GlobalArgs) -> Result<(), Fai
     Ok(())
 }
 
-/// Measures all points, each in a process of its own.
+/// Measures all points, each in its own process.
 pub(super) fn report(
     gaussians: &[usize],
     sizes: &[PhotoSize],
@@ -149,7 +149,7 @@ fn child(
     if !output.status.success() {
         let said = String::from_utf8_lossy(&output.stderr);
         let words: Vec<&str> = said.split_whitespace().collect();
-        // What runs out of memory says nothing.
+        // A process that runs out of memory leaves no message.
         return Err(failed(format!("{} {}", output.status, words.join(" "))));
     }
     serde_json::from_slice(&output.stdout).map_err(|error| failed(error.to_string()))

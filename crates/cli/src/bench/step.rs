@@ -1,4 +1,4 @@
-//! `splat bench step`: what a training step takes.
+//! `splat bench step`: the cost of a training step.
 
 use std::path::PathBuf;
 
@@ -12,8 +12,8 @@ use crate::report::metrics::write_json;
 use crate::report::probe_files;
 use splat_lab::performance::{device_step, step};
 
-/// The training step: time, stages, work; on the CPU with one thread and all, on a device with its
-/// launches, memory and share of the memory's bandwidth
+/// The training step: time, stages and work; on the CPU with one thread and with all, on a device
+/// with launches, memory and share of memory bandwidth
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   splat bench step
@@ -29,7 +29,7 @@ pub(super) struct StepArgs {
     /// Also write the figures as JSON
     #[arg(long, value_name = "OUT")]
     json: Option<PathBuf>,
-    /// Also write the picture; of the CPU only
+    /// Also write the picture; CPU only
     #[arg(long, value_name = "OUT")]
     svg: Option<PathBuf>,
 }

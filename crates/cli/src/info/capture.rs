@@ -1,4 +1,4 @@
-//! What a capture is.
+//! Description of a capture.
 
 use std::fmt::Write;
 

@@ -3,8 +3,8 @@
 /// Width of the longest bar in characters.
 const BAR: usize = 40;
 
-/// A histogram of `values` over `bins` equal bins of `[start, end]`, values outside counted into
-/// the first and last bin. One line a bin: its range, a bar, its share.
+/// A histogram of `values` over `bins` equal bins of `[start, end]`; values outside count into the
+/// first and last bin. One line per bin: its range, a bar, its share.
 pub(super) fn histogram(
     values: impl Iterator<Item = f64>,
     start: f64,
@@ -14,7 +14,7 @@ pub(super) fn histogram(
     let mut counts = vec![0usize; bins];
     for value in values {
         let at = (value - start) / (end - start) * bins as f64;
-        // The cast saturates, so everything below the first bin lands in it.
+        // The cast saturates, so that everything below the first bin is counted there.
         counts[(at as usize).min(bins - 1)] += 1;
     }
     let total: usize = counts.iter().sum();

@@ -1,4 +1,4 @@
-//! What a scene is.
+//! Description of a scene.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -8,7 +8,7 @@ use splat_data::SplatData;
 use super::histogram::histogram;
 use super::{bounds, bounds_text};
 
-/// Below this opacity a Gaussian is never drawn, see `RasterizeSettings`.
+/// Opacity below which a Gaussian is never drawn, see `RasterizeSettings`.
 const ALPHA_MIN: f64 = 1.0 / 255.0;
 
 /// Describes the scene read from `path`.
@@ -67,7 +67,7 @@ pub(super) fn describe(path: &Path, scene: &SplatData) -> String {
     text
 }
 
-/// What is odd about the scene.
+/// Warnings about the scene.
 fn warnings(scene: &SplatData, opacities: impl Iterator<Item = f64>) -> Vec<String> {
     let no_rotation = |quat: &&[f32; 4]| quat.iter().all(|&q| q == 0.0);
     let overflows = |scales: &&[f32; 3]| scales.iter().any(|s| !s.exp().is_finite());
@@ -92,7 +92,8 @@ fn warnings(scene: &SplatData, opacities: impl Iterator<Item = f64>) -> Vec<Stri
     counted.chain(comments).collect()
 }
 
-/// The range of each axis without its lowest and highest hundredth, which stray far in most scenes.
+/// Range of each axis without its lowest and highest hundredth, which are far outliers in most
+/// scenes.
 pub(super) fn middle(positions: Vec<[f64; 3]>) -> [[f64; 2]; 3] {
     std::array::from_fn(|axis| {
         let mut values: Vec<f64> = positions.iter().map(|position| position[axis]).collect();
@@ -103,8 +104,8 @@ pub(super) fn middle(positions: Vec<[f64; 3]>) -> [[f64; 2]; 3] {
     })
 }
 
-/// The range of those `values` that are finite, widened to whole numbers; a flat Gaussian's scale
-/// is minus infinity.
+/// Range of the finite `values`, widened to whole numbers; the log-scale of a flat Gaussian is
+/// minus infinity.
 fn whole_range(values: impl Iterator<Item = f64>) -> (f64, f64) {
     let range = values
         .filter(|value| value.is_finite())
@@ -142,7 +143,7 @@ mod tests {
             ..SplatData::default()
         };
         let text = describe(Path::new("a.ply"), &scene);
-        // Flat ones are counted, and have no influence on the range.
+        // Flat Gaussians are counted, but do not affect the range.
         assert_eq!(
             whole_range([f64::NEG_INFINITY, -1.5, 2.5].into_iter()),
             (-2.0, 3.0)

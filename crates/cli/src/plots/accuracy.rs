@@ -7,11 +7,11 @@ use splat_lab::accuracy::report::{Report, Row};
 /// Size of the picture in pixels.
 const PICTURE: (u32, u32) = (900, 560);
 
-/// Error against time, both logarithmic: a point per case and backend, labelled with the case's
+/// Error against time, on logarithmic axes: a point per case and backend, labelled with the case's
 /// number.
 ///
 /// # Errors
-/// What the drawing library says.
+/// The drawing library's error.
 pub(crate) fn svg(report: &Report) -> Result<String, String> {
     let mut svg = String::new();
     {

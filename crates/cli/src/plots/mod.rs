@@ -1,4 +1,4 @@
-//! Plots of what the laboratory measures, as SVG.
+//! Plots of the laboratory's measurements, as SVG.
 
 pub(crate) mod accuracy;
 pub(crate) mod scaling;

@@ -1,4 +1,5 @@
-//! Step time against Gaussians and against pixels, and memory against Gaussians, all logarithmic.
+//! Step time against Gaussians and against pixels, and memory against Gaussians, on logarithmic
+//! axes.
 
 use std::ops::Range;
 
@@ -19,9 +20,9 @@ struct Panel {
     title: &'static str,
     across: (&'static str, fn(&Point) -> f64),
     up: Value,
-    /// What the points of a curve have in common.
+    /// The property shared by the points of a curve.
     by: (&'static str, fn(&Point) -> f64),
-    /// Draw how a linear cost would grow from the first point of the lowest curve.
+    /// Draw linear growth from the first point of the lowest curve.
     linear: bool,
 }
 
@@ -57,7 +58,7 @@ fn megabytes(point: &Point) -> Option<f64> {
     Some(point.memory()? as f64 / 1e6)
 }
 
-/// To a tenth, as images of an asked-for size are.
+/// Rounded to a tenth, as image sizes only approximate the requested size.
 fn megapixels(point: &Point) -> f64 {
     (point.work.pixels / 1e5).round() / 10.0
 }
@@ -111,7 +112,7 @@ impl Panel {
         if self.linear
             && let Some(from) = bottom_left(&curves)
         {
-            // Cut where it leaves the panel.
+            // Clipped to the panel.
             let last = across.end.min(from.0 * up.end / from.1);
             let line = [from, (last, from.1 * last / from.0)];
             let style = BLACK.mix(0.5);
@@ -143,7 +144,7 @@ impl Panel {
             .draw()
     }
 
-    /// Curves of the points that have a value, each with its label; from left to right.
+    /// Curves of the points that have a value, each with its label, from left to right.
     fn curves(&self, points: &[Point]) -> Vec<(String, Vec<(f64, f64)>)> {
         let mut curves: Vec<(f64, Vec<(f64, f64)>)> = vec![];
         for point in points {
@@ -177,7 +178,7 @@ fn bottom_left(curves: &[(String, Vec<(f64, f64)>)]) -> Option<(f64, f64)> {
     first.min_by(|a, b| a.1.total_cmp(&b.1))
 }
 
-/// The range of positive values, a little wider; nothing where there is none.
+/// Range of the positive values, slightly widened; `None` if there are none.
 fn widened(values: impl Iterator<Item = f64>) -> Option<Range<f64>> {
     let (least, most) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |range, value| {
         (range.0.min(value), range.1.max(value))

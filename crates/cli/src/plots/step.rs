@@ -1,4 +1,4 @@
-//! What the time of a step goes to: one bar per setting, its stages end to end.
+//! Breakdown of a step's time: one bar per setting, with its stages end to end.
 
 use plotters::coord::Shift;
 use plotters::element::Rectangle;
@@ -69,7 +69,7 @@ fn draw_bars<'a>(
     let beside = ("sans-serif", 13).into_text_style(area);
     let beside = beside.pos(Pos::new(HPos::Right, VPos::Center));
     for (index, row) in rows.iter().enumerate() {
-        // From the top down.
+        // From top to bottom.
         let middle = (rows.len() - index) as f64 - 0.5;
         let mut from = 0.0;
         let mut bars = vec![];
@@ -107,8 +107,8 @@ fn draw_legend<'a>(
     Ok(())
 }
 
-/// Colours that neighbours can be told apart by: hues a golden section of the circle apart, dark
-/// and light in turn.
+/// Colours that distinguish neighbours: hues a golden section of the circle apart, alternately dark
+/// and light.
 fn color_of(index: usize) -> RGBAColor {
     let hue = (index as f64 * 0.381_966).fract();
     HSLColor(hue, 0.55, if index.is_multiple_of(2) { 0.45 } else { 0.65 }).to_rgba()

@@ -1,4 +1,4 @@
-//! Cameras to render from: a capture's, a file's, or on a circle.
+//! Cameras to render from: those of a capture or a file, or on a circle.
 
 use std::f64::consts::TAU;
 use std::path::Path;
@@ -12,16 +12,16 @@ use splat_model::ops::ImageSize;
 use super::super::{Failure, text};
 use splat_data::{Capture, View};
 
-/// Most pixels on a side: one picture of this size is about 3 GB in the making.
+/// Largest side in pixels: a picture of this size takes about 3 GB while rendering.
 const MOST_PIXELS: u32 = 16_384;
-/// Picture and opening of the orbit's cameras.
+/// Picture size and field of view of the orbit's cameras.
 const ORBIT_SIZE: ImageSize = ImageSize {
     width: 640,
     height: 480,
 };
 const ORBIT_FOCAL: f64 = 600.0;
 
-/// The cameras of every view of a capture, by the photo's name.
+/// Cameras of all views of a capture, by the photo's name.
 pub(super) fn of_capture(capture: &Capture) -> Vec<(String, Camera)> {
     let named = |view: &View| (view.name.clone(), view.camera());
     capture.views.iter().map(named).collect()
@@ -38,12 +38,12 @@ struct FileCamera {
     viewmat: [[f64; 4]; 4],
 }
 
-/// The cameras of a file, by their names or their place in it.
+/// Cameras of a file, by their names or their index.
 pub(super) fn of_file(path: &Path) -> Result<Vec<(String, Camera)>, Failure> {
     text::read(path, of_text)
 }
 
-/// The cameras of a file's text.
+/// Cameras in a file's text.
 fn of_text(text: &str) -> Result<Vec<(String, Camera)>, String> {
     let read = || -> serde_json::Result<Vec<FileCamera>> {
         match serde_json::from_str(text)? {
@@ -97,8 +97,8 @@ impl FileCamera {
     }
 }
 
-/// `count` cameras on a level circle about the middle of the scene, looking at it. Up is -y, as in
-/// the frame of a camera held upright. The middle is the median of each axis; the circle holds nine
+/// `count` cameras on a horizontal circle about the middle of the scene, looking at it. Up is -y,
+/// as for a camera held upright. The middle is the median of each axis; the circle keeps nine
 /// tenths of the scene in view.
 pub(super) fn orbit(scene: &SplatData, count: u32) -> Vec<(String, Camera)> {
     let origin = DVec3::from(scene.origin);
@@ -107,10 +107,10 @@ pub(super) fn orbit(scene: &SplatData, count: u32) -> Vec<(String, Camera)> {
     }));
     let distance = |mean: &[f32; 3]| DVec3::from(mean.map(f64::from)).distance(middle);
     let reach = quantile(scene.means.iter().map(distance), 0.9);
-    // One Gaussian, or all in one place.
+    // One Gaussian, or all at one position.
     let size = scene.scene_scale().length();
     let reach = if reach > 0.0 { reach } else { size };
-    // A sphere of that radius just fits the picture's height.
+    // A sphere of that radius just fits the height of the picture.
     let half_height = f64::from(ORBIT_SIZE.height) / 2.0;
     let radius = reach * (ORBIT_FOCAL / half_height).hypot(1.0);
     (0..count)
@@ -138,7 +138,7 @@ pub(super) fn orbit(scene: &SplatData, count: u32) -> Vec<(String, Camera)> {
         .collect()
 }
 
-/// The value that `share` of the values do not exceed; 0 where there is none.
+/// The value that `share` of the values do not exceed; 0 if there are none.
 fn quantile(values: impl Iterator<Item = f64>, share: f64) -> f64 {
     let mut values: Vec<f64> = values.collect();
     values.sort_by(f64::total_cmp);
@@ -183,7 +183,7 @@ mod tests {
         assert_eq!(cameras[0].0, "camera_0000");
         assert_eq!(cameras[0].1.position(), DVec3::new(-1.0, -2.0, -3.0));
         assert_eq!(read(&format!("[{good}, {good}]")).unwrap().len(), 2);
-        // As some editors begin a text.
+        // Some editors start a text with this.
         assert_eq!(read(&format!("\u{FEFF}{good}")).unwrap().len(), 1);
         for (from, to) in [
             ("64", "0"),

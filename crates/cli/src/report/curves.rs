@@ -1,5 +1,4 @@
-//! The course of a run as one SVG: loss terms, held-out PSNR and number of Gaussians against the
-//! step.
+//! History of a run as one SVG: loss terms, held-out PSNR and number of Gaussians against the step.
 
 use std::ops::Range;
 use std::path::Path;
@@ -11,10 +10,10 @@ use super::{ReportError, write};
 
 /// Size of one panel in pixels.
 const PANEL: (u32, u32) = (800, 260);
-/// Most points drawn of one curve; longer ones are averaged over equal stretches of steps.
+/// Most points per curve; longer curves are averaged over equal intervals of steps.
 const MOST_POINTS: usize = 800;
 
-/// What is drawn: each panel only where it has a point.
+/// The curves; a panel is drawn only if it has points.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Curves {
     /// Loss terms by name, each (step, value).
@@ -142,8 +141,8 @@ impl Panel {
     }
 }
 
-/// At most [`MOST_POINTS`] points, each the mean of a stretch; values that are not finite are left
-/// out.
+/// At most [`MOST_POINTS`] points, each the mean of an interval; values that are not finite are
+/// dropped.
 fn thinned(points: &[(usize, f64)]) -> Vec<(f64, f64)> {
     let finite: Vec<(f64, f64)> = points
         .iter()
@@ -158,8 +157,8 @@ fn thinned(points: &[(usize, f64)]) -> Vec<(f64, f64)> {
     finite.chunks(stretch).map(mean).collect()
 }
 
-/// The range of `values`, a twentieth wider on each side and never empty; nothing where there is no
-/// value.
+/// Range of `values`, a twentieth wider on each side and never empty; `None` if there are no
+/// values.
 fn padded(values: impl Iterator<Item = f64>) -> Option<Range<f64>> {
     let (least, most) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |range, value| {
         (range.0.min(value), range.1.max(value))
@@ -189,7 +188,7 @@ mod tests {
         for word in ["<svg", "L1", "D-SSIM", "Gaussians", "loss", "</svg>"] {
             assert!(svg.contains(word), "no {word}");
         }
-        // No PSNR was given, so there is no panel for it; and the long curves were thinned.
+        // Without PSNR there is no panel for it; and the long curves were thinned.
         assert!(!svg.contains("PSNR"));
         assert!(svg.len() < 100_000, "{}", svg.len());
 

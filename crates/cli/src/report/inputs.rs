@@ -1,15 +1,15 @@
-//! What a command reads is not replaced by what it writes.
+//! Protection of a command's inputs from its outputs.
 
 use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 
 use super::ReportError;
 
-/// Refuses outputs that are files which the command reads, under whatever name.
+/// Refuses outputs that are files which the command reads, under any name.
 ///
 /// # Errors
 ///
-/// [`ReportError::Input`], naming the first.
+/// [`ReportError::Input`], naming the first such file.
 pub fn refuse_inputs<'a>(
     outputs: impl IntoIterator<Item = PathBuf>,
     inputs: impl IntoIterator<Item = &'a Path>,
@@ -18,7 +18,7 @@ pub fn refuse_inputs<'a>(
         .into_iter()
         .filter_map(|path| path.canonicalize().ok());
     let inputs: HashSet<PathBuf> = inputs.collect();
-    // What is not there yet is no input.
+    // A file that does not exist is no input.
     let is_input = |path: &PathBuf| path.canonicalize().is_ok_and(|path| inputs.contains(&path));
     match outputs.into_iter().find(is_input) {
         None => Ok(()),

@@ -1,4 +1,4 @@
-//! The loss of every step: `losses.csv`, for whoever wants to plot or compare runs.
+//! The loss of every step, as `losses.csv`, for plotting and comparing runs.
 
 use std::fmt::Write;
 use std::path::Path;
@@ -33,7 +33,7 @@ fn csv(history: &History) -> String {
     text
 }
 
-/// A field that any reader of RFC 4180 takes as it is.
+/// A field quoted for readers of RFC 4180.
 fn quoted(name: &str) -> String {
     if name.contains([',', '"', '\n', '\r']) {
         format!("\"{}\"", name.replace('"', "\"\""))

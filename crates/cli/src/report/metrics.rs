@@ -7,28 +7,27 @@ use serde::Serialize;
 use super::{ReportError, write};
 use splat_trainer::Scores;
 
-/// Everything in `metrics.json`, in the order of its fields.
+/// Contents of `metrics.json`, in the order of its fields.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Metrics {
-    /// Quality on the held-out views: `psnr`, `ssim`, `views`. What does not exist (the mean over
-    /// no view) or is infinite (the PSNR of a perfect copy) is `null`.
+    /// Scores on the held-out views: `psnr`, `ssim`, `views`. Undefined values (the mean over no
+    /// view) and infinite ones (the PSNR of a perfect copy) are `null`.
     #[serde(flatten)]
     pub scores: Scores,
-    /// Number of Gaussians of the scene.
+    /// Number of Gaussians.
     pub gaussians: usize,
     /// Number of steps trained.
     pub steps: usize,
     /// Seconds spent training.
     pub seconds: f64,
-    /// Seconds a step took on average.
+    /// Mean seconds per step.
     pub seconds_per_step: f64,
-    /// Most memory that was resident, `null` where the system does not say
+    /// Peak resident memory; `null` if the system does not report it
     /// ([`super::memory::peak_rss_bytes`]).
     pub peak_rss_bytes: Option<u64>,
-    /// Memory that a CubeCL device's allocator held at the end, what it keeps for reuse included;
-    /// `null` elsewhere.
+    /// Memory held by a CubeCL device's allocator at the end, including reserves; `null` elsewhere.
     pub device_bytes: Option<u64>,
-    /// What was computed on.
+    /// Name of the device.
     pub device: String,
     /// Seed of the run.
     pub seed: u64,

@@ -1,8 +1,8 @@
-//! What a run leaves behind and shows: pictures, curves, figures, progress.
+//! Output of runs: pictures, curves, figures, progress.
 //!
-//! Everything is written by [`write_atomically`](splat_data::write_atomically): beside its place
-//! first, then renamed, so that an interrupted run leaves either the old file or the new one; what
-//! cannot be made again by [`write_durably`](splat_data::write_durably).
+//! Everything is written by [`write_atomically`](splat_data::write_atomically), to a temporary file
+//! that is then renamed, so that an interrupted run leaves either the old file or the new one. Data
+//! that cannot be recomputed is written by [`write_durably`](splat_data::write_durably).
 
 pub mod curves;
 mod inputs;
@@ -26,7 +26,7 @@ pub enum ReportError {
     /// The file could not be written.
     #[error(transparent)]
     Write(#[from] WriteError),
-    /// The file is one that the command reads.
+    /// The file is an input of the command.
     #[error("{}: the command reads this file, and would replace it; write to another place", path.display())]
     Input {
         /// The file.
@@ -37,18 +37,19 @@ pub enum ReportError {
     Encode {
         /// The file.
         path: PathBuf,
-        /// What is wrong.
+        /// The reason.
         reason: String,
     },
-    /// A picture whose values do not fill its size, or two of different height side by side.
+    /// The values of a picture do not match its size, or two pictures side by side differ in
+    /// height.
     #[error("picture: {reason}")]
     Shape {
-        /// What does not fit.
+        /// The mismatch.
         reason: String,
     },
 }
 
-/// [`write_atomically`](splat_data::write_atomically), its error naming the file.
+/// [`write_atomically`](splat_data::write_atomically), with an error that names the file.
 fn write(path: &Path, contents: &[u8]) -> Result<(), ReportError> {
     splat_data::write_atomically(path, contents).map_err(|source| {
         ReportError::Write(WriteError {

@@ -1,4 +1,4 @@
-//! Pictures: 8-bit RGB from what a renderer returns, side by side, to PNG.
+//! Pictures: from rendered values to 8-bit RGB, side by side, to PNG.
 
 use std::io::Cursor;
 use std::path::Path;
@@ -7,7 +7,7 @@ use image::{ImageFormat, RgbImage};
 
 use super::{ReportError, write};
 
-/// Width in pixels of the white strip between two pictures side by side.
+/// Width in pixels of the white gap between two pictures side by side.
 const GAP: u32 = 4;
 
 /// An 8-bit RGB picture.
@@ -41,7 +41,7 @@ impl Picture {
     ///
     /// # Errors
     ///
-    /// [`ReportError::Shape`] unless there are as many.
+    /// [`ReportError::Shape`] unless there are `3 width height` bytes.
     pub fn from_rgb8(width: u32, height: u32, bytes: Vec<u8>) -> Result<Self, ReportError> {
         let len = bytes.len();
         let fits = len as u128 == 3 * u128::from(width) * u128::from(height);
@@ -62,11 +62,11 @@ impl Picture {
         self.pixels.height()
     }
 
-    /// This picture on the left of `right`, with a white strip between them: truth beside render.
+    /// Puts `right` to the right of this picture, with a white gap, for photo and render.
     ///
     /// # Errors
     ///
-    /// [`ReportError::Shape`] where the heights differ.
+    /// [`ReportError::Shape`] if the heights differ.
     pub fn beside(&self, right: &Self) -> Result<Self, ReportError> {
         if self.height() != right.height() {
             return Err(ReportError::Shape {
@@ -107,7 +107,7 @@ impl Picture {
     }
 }
 
-/// `[0, 1]` to 0..=255, rounded to nearest. The cast saturates and takes NaN to 0.
+/// Maps `[0, 1]` to 0..=255, rounded to nearest. The cast saturates and maps NaN to 0.
 fn to_byte(value: f32) -> u8 {
     (value * 255.0).round() as u8
 }
@@ -129,7 +129,7 @@ mod tests {
             f32::INFINITY,
         ];
         assert_eq!(values.map(to_byte), [0, 0, 1, 128, 255, 255, 0, 255]);
-        // A photo survives the way through float.
+        // A photo survives the conversion through float.
         for byte in 0..=255u8 {
             assert_eq!(to_byte(f32::from(byte) / 255.0), byte);
         }

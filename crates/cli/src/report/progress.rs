@@ -1,22 +1,21 @@
-//! Progress of long work: a bar on a terminal, a plain line every so often elsewhere, nothing when
-//! quiet.
+//! Progress of long work: a bar on a terminal, periodic plain lines elsewhere, nothing if quiet.
 //!
-//! All of it goes to standard error, so that standard output holds results alone.
+//! It is written to standard error, so that standard output contains results only.
 
 use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
 
-/// Time between plain lines.
+/// Interval of plain lines.
 const LINE_EVERY: Duration = Duration::from_secs(10);
 
-/// Shows how far a piece of work is.
+/// Shows the progress of some work.
 #[derive(Debug)]
 pub struct Progress {
     output: Output,
     total: u64,
-    /// Steps done before this run, which its rate does not count.
+    /// Steps done before this run, excluded from its rate.
     start: u64,
     started: Instant,
 }
@@ -29,14 +28,14 @@ enum Output {
 }
 
 impl Progress {
-    /// Starts showing work of `total` steps, `start` of which are done already.
+    /// Starts showing work of `total` steps, of which `start` are already done.
     pub fn new(total: u64, start: u64, quiet: bool) -> Self {
         let output = if quiet {
             Output::Quiet
         } else if std::io::stderr().is_terminal() {
             let bar = ProgressBar::new(total).with_position(start);
             let style = "{bar:30} {pos}/{len}  {per_sec}  {msg}  {eta} left";
-            // The template is fixed; were it wrong, indicatif's own style is no reason to stop.
+            // The template is fixed. If it were wrong, indicatif's default style would do.
             if let Ok(style) = ProgressStyle::with_template(style) {
                 bar.set_style(style);
             }
@@ -55,8 +54,7 @@ impl Progress {
         }
     }
 
-    /// Says that `done` steps are done; `message` (such as the loss) is only built where it is
-    /// shown.
+    /// Reports `done` steps. `message` (such as the loss) is only built if it is shown.
     pub fn update(&mut self, done: u64, message: impl FnOnce() -> String) {
         match &mut self.output {
             Output::Bar(bar) => {
@@ -73,7 +71,7 @@ impl Progress {
         }
     }
 
-    /// Shows a line of its own, above the bar.
+    /// Shows a separate line above the bar.
     pub fn note(&self, line: &str) {
         match &self.output {
             Output::Bar(bar) => bar.suspend(|| tell(line)),
@@ -82,7 +80,7 @@ impl Progress {
         }
     }
 
-    /// Ends the bar, which stays visible.
+    /// Ends the bar and leaves it visible.
     pub fn finish(&self) {
         if let Output::Bar(bar) = &self.output {
             bar.abandon();
@@ -100,8 +98,7 @@ fn plain_line(done: u64, total: u64, here: u64, elapsed: Duration, message: &str
     line
 }
 
-/// Writes a line that is no result. That nobody reads it (a closed pipe) is no error, and ends no
-/// run.
+/// Writes a line that is not a result. A closed pipe is not an error, and ends no run.
 pub(crate) fn tell(line: &str) {
     let _ = writeln!(std::io::stderr(), "{line}");
 }

@@ -1,33 +1,32 @@
-//! File names of the pictures of views: one for each, whatever the views are called.
+//! File names for the pictures of views, unique for any view names.
 
 use std::collections::{BTreeSet, HashMap, HashSet};
 use std::path::Path;
 
-/// Bytes of a name's stem at most; systems take 255 for a whole name.
+/// Longest stem in bytes; systems allow 255 for a whole name.
 const MOST_BYTES: usize = 220;
 
-/// Stems of the files of several views, all different, also where a file system takes upper and
-/// lower case for one.
+/// File stems of several views, distinct even on file systems that ignore case.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct ViewNames {
-    /// For every view, in the order given: the name of its picture without `.png`.
+    /// Name of each view's picture without `.png`, in the given order.
     pub stems: Vec<String>,
-    /// View and stem where another view would have had the same file.
+    /// View and stem, for views that would have shared a file.
     pub renamed: Vec<(String, String)>,
 }
 
 impl ViewNames {
-    /// Names the pictures of the views called `names`. A picture is written to the stem, one of
-    /// `suffixes` and `.png`; no two of these files are one.
+    /// Names the pictures of the views called `names`. Each picture is written to the stem, one of
+    /// `suffixes`, and `.png`; no two of these files collide.
     ///
-    /// The stem is the view's name without its ending, in one folder: separators become `_`. Views
-    /// that would share a file get theirs with the ending of their name (`shot_jpg`, `shot_png`),
-    /// or, where that is one too, with a number.
+    /// The stem is the view's name without its extension, in one folder: separators become `_`.
+    /// Views that would share a file keep their extension (`shot_jpg`, `shot_png`), or get a number
+    /// if that collides too.
     pub fn new<'a>(names: impl IntoIterator<Item = &'a str>, suffixes: &[&str]) -> Self {
         let names: Vec<&str> = names.into_iter().collect();
         let suffixes: BTreeSet<&&str> = suffixes.iter().collect();
         let mut stems: Vec<String> = names.iter().map(|name| stem(name)).collect();
-        // Lower case after upper case: some letters have one form in the one and two in the other.
+        // Lower case after upper case: some letters have one form in one and two in the other.
         let key = |file: String| file.to_uppercase().to_lowercase();
         let files = |stem: &str| -> Vec<String> {
             suffixes
@@ -42,7 +41,7 @@ impl ViewNames {
         let shared: Vec<usize> = (0..names.len())
             .filter(|&view| files(&stems[view]).iter().any(|file| wanted[file] > 1))
             .collect();
-        // How many views would have this name with its ending.
+        // Number of views with each name, extension included.
         let mut with_ending: HashMap<String, usize> = HashMap::new();
         for &view in &shared {
             *with_ending.entry(key(flat(names[view]))).or_default() += 1;
@@ -54,7 +53,7 @@ impl ViewNames {
             let ending = Some(ending).filter(|ending| with_ending[&key(ending.clone())] == 1);
             let numbered = (1..).map(|number: u64| format!("{}_{number}", stems[view]));
             let is_free = |stem: &String| !files(stem).iter().any(|file| taken.contains(file));
-            // Numbers do not end.
+            // Numbers never run out.
             if let Some(free) = ending.into_iter().chain(numbered).find(is_free) {
                 taken.extend(files(&free));
                 renamed.push((names[view].to_owned(), free.clone()));
@@ -64,7 +63,7 @@ impl ViewNames {
         Self { stems, renamed }
     }
 
-    /// A line for the user about the renamed pictures, if there are any.
+    /// A line for the user about renamed pictures, if any.
     pub fn note(&self) -> Option<String> {
         const SHOWN: usize = 4;
         let shown = self.renamed.iter().take(SHOWN);
@@ -82,12 +81,12 @@ impl ViewNames {
     }
 }
 
-/// A view's name without its ending, in one folder.
+/// A view's name without its extension, in one folder.
 fn stem(name: &str) -> String {
     in_one_folder(&Path::new(name).with_extension("").to_string_lossy())
 }
 
-/// A view's name with its ending, in one folder.
+/// A view's name with its extension, in one folder.
 fn flat(name: &str) -> String {
     let stem = stem(name);
     match Path::new(name).extension() {
@@ -96,7 +95,7 @@ fn flat(name: &str) -> String {
     }
 }
 
-/// Replaces what separates folders, or ends a name for the system, and cuts what is too long.
+/// Replaces path separators and characters that end a name, and truncates long names.
 fn in_one_folder(name: &str) -> String {
     let mut name = name.replace(['/', '\\', ':', '\0'], "_");
     let mut end = name.len().min(MOST_BYTES);
@@ -111,7 +110,7 @@ fn in_one_folder(name: &str) -> String {
 mod tests {
     use super::*;
 
-    /// The stems of pictures without other channels.
+    /// Stems of pictures without other channels.
     fn stems(names: &[&str]) -> Vec<String> {
         ViewNames::new(names.iter().copied(), &[""]).stems
     }
@@ -146,7 +145,7 @@ mod tests {
             ]),
             ["shot_png", "a_b_c_1", "shot_jpg", "a_b_c_2", "other"]
         );
-        // What others are called is not taken from them.
+        // Names of other views are not taken from them.
         assert_eq!(
             stems(&[
                 "shot.png",
@@ -157,7 +156,7 @@ mod tests {
             ]),
             ["shot_2", "shot_3", "shot_png", "shot_jpg", "shot_1"]
         );
-        // One name three times, as a file of cameras may have it.
+        // One name three times, as a camera file may have.
         assert_eq!(stems(&["x", "x", "x", "x_2"]), ["x_1", "x_3", "x_4", "x_2"]);
     }
 

@@ -1,9 +1,9 @@
-//! The folder of a run: tried before the first step, written to when the run ends or is
-//! interrupted.
+//! The output folder of a run: checked before the first step, and written to when the run ends or
+//! is interrupted.
 //!
-//! What is worth most comes first: the scene, then the checkpoint, then what can be made again from
-//! them. Whatever cannot be saved, the rest is tried. The checkpoint is removed when all else is
-//! there, and not before.
+//! The most valuable files come first: the scene, then the checkpoint, then files that can be
+//! recomputed from them. If one cannot be saved, the rest are still tried. The checkpoint is
+//! removed only once everything else has been saved.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -30,24 +30,24 @@ pub(super) const SCENE: &str = "scene.ply";
 pub(super) const CHECKPOINT: &str = "checkpoint.safetensors";
 /// The settings' file.
 pub(super) const CONFIG: &str = "config.toml";
-/// The figures' file, the last to be written.
+/// The figures' file, written last.
 pub(super) const METRICS: &str = "metrics.json";
 const LOSSES: &str = "losses.csv";
 const CURVES: &str = "curves.svg";
 /// The pictures' folder.
 const VIEWS: &str = "views";
 
-/// Where a run leaves its results.
+/// Where a run writes its results.
 pub(super) struct RunFolder<'a> {
     pub folder: &'a Path,
-    /// What `config.toml` will hold.
+    /// Contents of `config.toml`.
     pub config: &'a str,
-    /// What to type to go on with the run.
+    /// The command that resumes the run.
     pub resume: &'a CommandLine,
     pub global: &'a GlobalArgs,
 }
 
-/// What was saved, and what was not and why.
+/// Files that were saved, and files that were not, with the reason.
 #[derive(Default)]
 struct Saving {
     saved: Vec<&'static str>,
@@ -66,8 +66,8 @@ impl Saving {
 }
 
 impl RunFolder<'_> {
-    /// Tries whether everything can be written, before it is worth anything, and without replacing
-    /// a photo.
+    /// Checks that everything can be written, before there is anything to lose, and without
+    /// replacing a photo.
     pub(super) fn probe(&self, capture: &Capture) -> Result<(), ReportError> {
         let pictures = picture_names(capture).stems;
         let pictures = pictures.iter().map(|stem| self.picture(stem));
@@ -89,14 +89,14 @@ impl RunFolder<'_> {
         self.folder.join(VIEWS).join(format!("{stem}.png"))
     }
 
-    /// Whether another run's results lie here.
+    /// True if the results of another run are here.
     pub(super) fn is_taken(&self) -> bool {
         [SCENE, METRICS]
             .iter()
             .any(|name| self.folder.join(name).exists())
     }
 
-    /// The error of a run that could not go on, with the way to go on from what was kept of it.
+    /// Error of a run that could not continue, with the command to resume from its saved state.
     pub(super) fn stopped(&self, error: Failure) -> Failure {
         if !self.folder.join(CHECKPOINT).is_file() {
             return error;
@@ -108,7 +108,7 @@ impl RunFolder<'_> {
         ))
     }
 
-    /// Keeps an interrupted run.
+    /// Saves an interrupted run.
     pub(super) fn interrupted(&self, trained: &Trained) -> Result<(), Failure> {
         let mut saving = Saving::default();
         let scene = self.save_scene(&mut saving, trained);
@@ -118,8 +118,8 @@ impl RunFolder<'_> {
         self.outcome(saving)
     }
 
-    /// Keeps a complete run, measures it, and removes its checkpoint. The scores, if they could be
-    /// measured, and whether everything could be saved.
+    /// Saves a complete run, measures it, and removes its checkpoint. Returns the scores, if they
+    /// could be measured, and whether everything could be saved.
     pub(super) fn complete(
         &self,
         trained: &Trained,
@@ -130,8 +130,7 @@ impl RunFolder<'_> {
         let mut saving = Saving::default();
         let scene = self.save_scene(&mut saving, trained);
         if !scene && self.folder.join(SCENE).exists() {
-            // Beside the scene of another run nothing of this one may lie but what it can be gone
-            // on with from.
+            // Beside the scene of another run, only the checkpoint of this one may be written.
             saving.keep(CHECKPOINT, self.save_checkpoint(trained));
             return (None, self.outcome(saving));
         }
@@ -148,7 +147,7 @@ impl RunFolder<'_> {
         (scores, self.outcome(saving))
     }
 
-    /// Saves the scene. Figures of one that was here before are not its own, and go.
+    /// Saves the scene. Figures of an earlier scene are removed.
     fn save_scene(&self, saving: &mut Saving, trained: &Trained) -> bool {
         let path = self.folder.join(SCENE);
         let saved = saving.keep(SCENE, ply::write(&path, &trained.to_data()));
@@ -172,7 +171,7 @@ impl RunFolder<'_> {
         }
     }
 
-    /// Saves the settings, unless the scene beside them is another one, and the course of the run.
+    /// Saves the settings (unless the scene beside them is another one) and the history of the run.
     fn save_course(&self, saving: &mut Saving, trained: &Trained, scene: bool) {
         if scene || !self.folder.join(SCENE).exists() {
             let path = self.folder.join(CONFIG);
@@ -197,7 +196,7 @@ impl RunFolder<'_> {
     ) -> Option<Scores> {
         let views: Vec<&View> = capture.test_views().collect();
         let names = picture_names(capture);
-        // Views come in the order given.
+        // Views are in the given order.
         let mut stems = names.stems.iter();
         let mut pictures = Vec::new();
         let mut written = Ok(());
@@ -225,7 +224,7 @@ impl RunFolder<'_> {
         }
     }
 
-    /// Says if there are pictures that are not of this scene. They may be somebody's, and stay.
+    /// Reports pictures that do not belong to this scene. They may be the user's and are kept.
     fn note_other_pictures(&self, own: &[PathBuf]) {
         let folder = self.folder.join(VIEWS);
         let Ok(entries) = std::fs::read_dir(&folder) else {
@@ -247,7 +246,7 @@ impl RunFolder<'_> {
         }
     }
 
-    /// Nothing if everything was saved; else an error that says what was and what was not.
+    /// An error that lists what was saved and what was not, unless everything was saved.
     fn outcome(&self, saving: Saving) -> Result<(), Failure> {
         let Some((_, reason)) = saving.failed.first() else {
             return Ok(());
@@ -292,20 +291,20 @@ fn metrics(
     }
 }
 
-/// The names of the held-out views' pictures.
+/// Names of the held-out views' pictures.
 pub(super) fn picture_names(capture: &Capture) -> ViewNames {
     let names = capture.test_views().map(|view| view.name.as_str());
     ViewNames::new(names, &[""])
 }
 
-/// Writes truth beside render.
+/// Writes photo and render side by side.
 fn write_view(path: &Path, view: &View, rendered: &[f32]) -> Result<(), ReportError> {
     let truth = Picture::from_rgb8(view.width, view.height, view.image.to_vec())?;
     let render = Picture::from_rgb_f32(view.width, view.height, rendered)?;
     truth.beside(&render)?.write(path)
 }
 
-/// The course of the run: the weighted sum, then each term.
+/// History of the run: the weighted sum, then each term.
 fn curves(history: &History) -> Curves {
     let mut curves = Curves {
         held_out_psnr: history.held_out_psnr.clone(),

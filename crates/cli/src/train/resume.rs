@@ -1,4 +1,4 @@
-//! `--resume`: which run to go on with, and that no run is begun over one that is not complete.
+//! `--resume`: finds the run to resume, and refuses to start over an incomplete one.
 
 use std::path::{Path, PathBuf};
 
@@ -8,13 +8,13 @@ use splat_trainer::Checkpoint;
 
 /// An interrupted run.
 pub(super) struct Interrupted {
-    /// Its checkpoint's file.
+    /// Path of the checkpoint.
     pub path: PathBuf,
     pub checkpoint: Checkpoint,
 }
 
 impl Interrupted {
-    /// Reads the run in a folder, or the checkpoint itself. What is neither is named in words.
+    /// Reads the run in a folder, or a checkpoint file. Errors describe what was found instead.
     pub(super) fn open(given: &Path) -> Result<Self, Failure> {
         let path = match given.is_dir() {
             true => given.join(CHECKPOINT),
@@ -37,7 +37,7 @@ impl Interrupted {
     }
 }
 
-/// Why there is nothing to go on with, if it can be told without reading a file.
+/// Why there is nothing to resume, if that can be told without reading a file.
 fn not_resumable(given: &Path, checkpoint: &Path) -> Option<String> {
     if !given.exists() {
         return Some("no such folder or file; give the folder of an interrupted run".to_owned());
@@ -77,15 +77,15 @@ fn not_resumable(given: &Path, checkpoint: &Path) -> Option<String> {
     }
 }
 
-/// Refuses to write to a folder that holds the checkpoint of another run than the `resumed` one: it
-/// is all there is of that run.
+/// Refuses to write to a folder that contains the checkpoint of a run other than the `resumed` one:
+/// it is all that is left of that run.
 pub(super) fn refuse_unfinished(out: &Path, resumed: Option<&Path>) -> Result<(), Failure> {
     let path = out.join(CHECKPOINT);
     let same = |other: &Path| match (other.canonicalize(), path.canonicalize()) {
         (Ok(other), Ok(path)) => other == path,
         _ => false,
     };
-    // A folder in its place is no checkpoint, and told as what it is.
+    // A folder of that name is no checkpoint, and is reported as such.
     if !path.is_file() || resumed.is_some_and(same) {
         return Ok(());
     }

@@ -1,4 +1,4 @@
-//! Runs that are interrupted, gone on with, written over, or cannot be saved.
+//! Runs that are interrupted, resumed, overwritten, or cannot be saved.
 
 use std::process::{Child, Stdio};
 use std::time::{Duration, Instant};
@@ -7,7 +7,7 @@ use super::*;
 
 /// The example capture at an eighth of its size.
 const SMALL: [&str; 2] = ["--downscale", "8"];
-/// The files of a complete run, next to `views`.
+/// Files of a complete run, besides `views`.
 const RESULTS: [&str; 5] = [
     "scene.ply",
     "config.toml",
@@ -16,8 +16,8 @@ const RESULTS: [&str; 5] = [
     "curves.svg",
 ];
 
-/// `splat --device cpu train` with these arguments, in the folder of `capture`, which it writes
-/// `out` to.
+/// `splat --device cpu train` with these arguments, run in the folder of `capture`, where it writes
+/// `out`.
 fn training(capture: &Path, out: &str, more: &[&str]) -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_splat"));
     command
@@ -35,7 +35,7 @@ fn small_run(capture: &Path, out: &str, more: &[&str]) -> Output {
         .unwrap()
 }
 
-/// The command under a limit of the size of files, as a full disk would have it.
+/// The command under a file size limit, to simulate a full disk.
 fn limited(command: &Command, bytes: u64) -> Command {
     let script = format!("ulimit -f {}; exec \"$0\" \"$@\"", bytes / 512);
     let mut limited = Command::new("sh");
@@ -47,7 +47,7 @@ fn limited(command: &Command, bytes: u64) -> Command {
     limited
 }
 
-/// Waits until something is so.
+/// Waits for a condition.
 fn wait_for(what: &str, is_so: impl Fn() -> bool) {
     let start = Instant::now();
     while !is_so() {
@@ -63,7 +63,7 @@ fn interrupt(child: &Child) {
     assert!(kill.unwrap().success());
 }
 
-/// A run that was interrupted after its first checkpoint; what it said.
+/// Interrupts a run after its first checkpoint; returns its messages.
 fn interrupted(capture: &Path, out: &str, more: &[&str]) -> String {
     let endless = ["--steps", "100000", "--autosave", "0"];
     let child = training(capture, out, &[&SMALL[..], &endless, more].concat())
@@ -78,7 +78,7 @@ fn interrupted(capture: &Path, out: &str, more: &[&str]) -> String {
     stderr(&output)
 }
 
-/// The files of a folder with their contents, but for those of sub-folders.
+/// Files of a folder with their contents, excluding subfolders.
 fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     let entries = fs::read_dir(folder).unwrap().map(|e| e.unwrap().path());
     let files = entries.filter(|path| path.is_file());
@@ -89,7 +89,7 @@ fn contents(folder: &Path) -> Vec<(PathBuf, Vec<u8>)> {
     files
 }
 
-/// Bad input in one line of these words, after which `folder` is as it was.
+/// Bad input is reported in one line with these words, and `folder` is unchanged.
 fn refused_without_loss(
     output: &Output,
     before: &[(PathBuf, Vec<u8>)],
@@ -109,7 +109,7 @@ fn stderr(output: &Output) -> String {
     String::from_utf8_lossy(&output.stderr).into_owned()
 }
 
-/// The printed command goes on with the run as it stands there, whatever the paths are called.
+/// The printed command resumes the run, whatever the paths are called.
 #[test]
 fn the_printed_commands_work_when_pasted() {
     let folder = TempDir::new().unwrap();
@@ -149,7 +149,7 @@ fn the_printed_commands_work_when_pasted() {
     assert_eq!(metrics["steps"], done + 3);
     assert_eq!(metrics["seed"], 5);
     assert!(!left.join("checkpoint.safetensors").exists());
-    // It is another run than one of so many steps, and says so.
+    // It differs from an uninterrupted run of that many steps, and says so.
     assert!(
         stderr(&output).contains("cannot be repeated"),
         "{}",
@@ -161,7 +161,7 @@ fn the_printed_commands_work_when_pasted() {
         "{config}"
     );
 
-    // A name with a line break does not spill its second half into the settings.
+    // A name with a line break does not leak into the settings.
     let broken = "a\nseed = 1\nb";
     succeed(&small_run(
         &capture,
@@ -182,7 +182,7 @@ fn the_printed_commands_work_when_pasted() {
     assert!(scene() == first);
 }
 
-// Longer than a hundred lines: one run, told from its beginning to its end.
+// Longer than a hundred lines, as it follows one run from start to end.
 #[test]
 fn a_run_is_gone_on_with_as_it_was_begun_or_not_at_all() {
     let folder = TempDir::new().unwrap();
@@ -202,7 +202,7 @@ fn a_run_is_gone_on_with_as_it_was_begun_or_not_at_all() {
         refused_without_loss(&output, &before, &out, words);
     };
 
-    // Fewer steps than are done would leave nothing of it.
+    // Fewer steps than are done leave nothing to train.
     refused(
         resume(&capture, "out", &["--steps", "1"]),
         &["steps are done", "ask for more"],
@@ -217,7 +217,7 @@ fn a_run_is_gone_on_with_as_it_was_begun_or_not_at_all() {
             &[words, "leave that out"],
         );
     }
-    // The same capture with one number of one camera changed, another split, one photo fewer.
+    // The same capture with one number of one camera changed, another split, or one photo fewer.
     let model = capture.join("sparse/0/images.bin");
     let whole = fs::read(&model).unwrap();
     let mut moved = whole.clone();
@@ -244,7 +244,7 @@ fn a_run_is_gone_on_with_as_it_was_begun_or_not_at_all() {
     );
     fs::remove_file(&split).unwrap();
 
-    // What is no run to go on with.
+    // Inputs that are no run to resume.
     refused(
         resume(&capture, "nowhere", &[]),
         &["nowhere", "no such folder"],
@@ -270,7 +270,7 @@ fn a_run_is_gone_on_with_as_it_was_begun_or_not_at_all() {
         &["version 2", "begin the run again"],
     );
 
-    // Nor is another run begun in its place.
+    // Nor may another run start in its place.
     refused(
         small_run(&capture, "out", &["--steps", "2"]),
         &["checkpoint.safetensors", "--resume"],
@@ -280,8 +280,8 @@ fn a_run_is_gone_on_with_as_it_was_begun_or_not_at_all() {
     let elsewhere = resume(&capture, "out", &["--out", "done", "--seed", "8"]);
     refused(elsewhere, &["seed = 7, not 8"]);
 
-    // The file itself is as good as its folder; settings beside it that somebody changed are not
-    // the run's.
+    // The checkpoint file works as well as its folder; edited settings beside it are not those of
+    // the run.
     fs::write(out.join("config.toml"), "seed = 9").unwrap();
     let more = ["--steps", "100", "--max-gaussians", "10"];
     let output = resume(&capture, "out/checkpoint.safetensors", &more);
@@ -298,7 +298,7 @@ fn a_run_is_gone_on_with_as_it_was_begun_or_not_at_all() {
     assert!(!out.join("checkpoint.safetensors").exists());
 }
 
-/// What cannot be written is known before the first step: nothing else is in the folder then.
+/// Unwritable outputs are reported before the first step, and nothing else is in the folder then.
 #[test]
 fn the_folder_is_tried_before_the_first_step() {
     let folder = TempDir::new().unwrap();
@@ -324,7 +324,7 @@ fn the_folder_is_tried_before_the_first_step() {
     assert_eq!(output.status.code(), Some(2));
     assert_eq!(fs::read_dir(&out).unwrap().count(), 1);
 
-    // Figures too, before the views are rendered: the table comes with them.
+    // Figures are checked too, before the views are rendered: the table comes with them.
     succeed(&small_run(&capture, "done", &["--steps", "2"]));
     let scene = folder.path().join("done/scene.ply");
     let json = text(folder.path());
@@ -341,7 +341,7 @@ fn the_folder_is_tried_before_the_first_step() {
     assert!(output.stdout.is_empty() && stderr(&output).contains("a folder is in the place"));
 }
 
-/// The scene is smaller than the checkpoint, and comes first.
+/// The scene is smaller than the checkpoint, and is saved first.
 #[test]
 fn a_full_disk_takes_no_more_than_it_must() {
     let folder = TempDir::new().unwrap();
@@ -354,7 +354,7 @@ fn a_full_disk_takes_no_more_than_it_must() {
     // Room for a scene, not for a checkpoint.
     let run = training(&capture, "no_autosave", &[&SMALL[..], &steps].concat());
     succeed(&limited(&run, scene * 3 / 2).output().unwrap());
-    // Every autosave fails, and is told once.
+    // Every autosave fails, and is reported once.
     let run = training(
         &capture,
         "scene",
@@ -374,7 +374,7 @@ fn a_full_disk_takes_no_more_than_it_must() {
         assert!(read("scene", file).is_ok(), "no {file}");
     }
 
-    // No room for a scene beside that of another run: nothing of this one comes to lie there.
+    // No room for a scene beside that of another run: nothing of this run is written there.
     let of_before = || RESULTS.map(|file| read("whole", file).unwrap());
     let before = of_before();
     let run = training(&capture, "whole", &[&SMALL[..], &["--steps", "7"]].concat());
@@ -382,7 +382,7 @@ fn a_full_disk_takes_no_more_than_it_must() {
     assert_eq!(output.status.code(), Some(2), "{}", stderr(&output));
     assert!(of_before() == before);
 
-    // Interrupted: the scene is left, and it is said that the checkpoint is not.
+    // Interrupted: the scene is saved, and the message says that the checkpoint is not.
     let endless = ["--steps", "100000", "--autosave", "0"];
     let run = training(&capture, "stopped", &[&SMALL[..], &endless].concat());
     let log = folder.path().join("log");
@@ -406,7 +406,7 @@ fn a_full_disk_takes_no_more_than_it_must() {
     );
     assert!(read("stopped", "scene.ply").is_ok());
 
-    // Room for neither: everything else is there, and the exit status tells.
+    // Room for neither: everything else is saved, and the exit status says so.
     let run = training(&capture, "none", &[&SMALL[..], &steps].concat());
     let output = limited(&run, scene / 2).output().unwrap();
     let said = stderr(&output);
@@ -431,8 +431,8 @@ fn a_full_disk_takes_no_more_than_it_must() {
     assert!(read("none", "scene.ply").is_err());
 }
 
-/// When all steps are done and a result cannot be saved, the checkpoint is left, and with it the
-/// rest is done later.
+/// If a result cannot be saved after the last step, the checkpoint is kept, and resuming saves the
+/// rest.
 #[test]
 fn a_run_whose_results_could_not_be_saved_is_finished_later() {
     let folder = TempDir::new().unwrap();
@@ -445,7 +445,7 @@ fn a_run_whose_results_could_not_be_saved_is_finished_later() {
         .spawn()
         .unwrap();
     wait_for("checkpoint", || out.join("checkpoint.safetensors").exists());
-    // After the folder was tried.
+    // After the check of the folder.
     fs::write(out.join("views"), "in the way").unwrap();
     let output = child.wait_with_output().unwrap();
     let said = stderr(&output);
@@ -475,7 +475,7 @@ fn a_run_whose_results_could_not_be_saved_is_finished_later() {
     assert!(!out.join("checkpoint.safetensors").exists());
 }
 
-/// How a scene must be rendered is in its file, whatever lies beside it.
+/// The scene's file determines how it is rendered, whatever is beside it.
 #[test]
 fn a_scenes_settings_stay_with_the_scene() {
     let folder = TempDir::new().unwrap();
@@ -507,7 +507,7 @@ fn a_scenes_settings_stay_with_the_scene() {
     };
     let (table, _) = eval(&first);
     assert!(table.contains(&format!("{psnr:.3}")), "{table}");
-    // Another run, whose settings are others, says what it replaces.
+    // A run with other settings reports what it replaces.
     let output = small_run(&capture, "out", &steps);
     succeed(&output);
     assert_eq!(eval(&first).0, table);
@@ -515,8 +515,8 @@ fn a_scenes_settings_stay_with_the_scene() {
     fs::remove_file(out.join("config.toml")).unwrap();
     assert_eq!(eval(&first).0, table);
 
-    // A scene that does not say is asked of its config.toml, and one that is not a run's is passed
-    // over with a word.
+    // For a scene that does not say, its config.toml is read; one that does not belong to a run is
+    // ignored with a message.
     let bytes = fs::read(&first).unwrap();
     let silent = String::from_utf8_lossy(&bytes[..600]).into_owned();
     let end = silent.find("element").unwrap();
@@ -538,7 +538,7 @@ fn a_scenes_settings_stay_with_the_scene() {
     );
 }
 
-/// Figures of an earlier scene do not stay beside a new one, and its pictures not without a word.
+/// Figures of an earlier scene are removed, and its pictures are reported.
 #[test]
 fn results_of_two_runs_are_not_mixed_up() {
     let folder = TempDir::new().unwrap();
@@ -572,7 +572,7 @@ fn results_of_two_runs_are_not_mixed_up() {
     let said = stderr(&output);
     assert!(said.contains("3 picture(s) were there before"), "{said}");
 
-    // Until a run is interrupted or ends, what is there stays as it is.
+    // Until a run is interrupted or ends, existing files stay unchanged.
     let said = interrupted(&capture, "out", &[]);
     assert!(said.contains("4 picture(s) were there before"), "{said}");
     assert!(!out.join("metrics.json").exists());
