@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# Everything that a machine with a GPU can measure of this project, in one go and into one JSON file.
+# Runs every GPU measurement of this project and writes one JSON file.
 #
 #   benches/gpu.sh                                   # wgpu, the example capture
 #   benches/gpu.sh --device vulkan --capture fox     # SPIR-V, a capture of yours
 #   benches/gpu.sh --device cuda --python .venv/bin/python   # and gsplat beside it
 #   benches/gpu.sh --smoke                           # tiny sizes, to try the script itself
 #
-# Needs cargo, bash and coreutils; gsplat's part also a Python with torch, gsplat, numpy and Pillow. A section that fails
-# is written down as failed, and the others go on; the exit status is then 1.
+# Needs cargo, bash and coreutils; the comparison with gsplat also a Python with torch, gsplat, numpy and Pillow. A failed
+# section is recorded and the others continue; the exit status is then 1.
 
 set -uo pipefail
 cd "$(dirname "$0")/.."
@@ -80,7 +80,7 @@ parts=$(mktemp -d) || fail "no temporary folder"
 trap 'rm -rf "$parts"' EXIT
 failed=0
 
-# A text as JSON.
+# Quotes a text for JSON.
 quoted() {
     local text=${1//\\/\\\\}
     text=${text//\"/\\\"}
@@ -89,7 +89,7 @@ quoted() {
     printf '"%s"' "$(printf '%s' "$text" | tr -d '\000-\010\013-\037')"
 }
 
-# Puts all sections so far into the one file, in the order in which they came.
+# Writes all sections so far to the output file, in order.
 assemble() {
     local first=true part
     {
@@ -104,7 +104,7 @@ assemble() {
 }
 
 number=0
-# section NAME RESULT COMMAND...: runs the command; RESULT is the JSON file that it leaves, or - if it leaves none.
+# section NAME RESULT COMMAND...: runs the command; RESULT is the JSON file that it writes, or - for none.
 section() {
     local name=$1 result=$2 status start stop log value=null
     shift 2
@@ -148,11 +148,11 @@ section machine - machine
 section build - cargo build --release --workspace --bin splat ${features[@]+"${features[@]}"}
 [[ -x $target/release/splat ]] || fail "there is no $target/release/splat; see $folder/build.log"
 
-# Through wgpu, or SPIR-V with --device vulkan. With --device cuda the kernels are checked on CUDA by the two after it.
+# Through wgpu, or SPIR-V with --device vulkan. With --device cuda, the next two sections check the kernels on CUDA.
 section tests - env SPLAT_REQUIRE_WGPU=1 cargo test --release --workspace ${features[@]+"${features[@]}"} ${tests[@]+"${tests[@]}"}
 section gradcheck "$folder/gradcheck.json" \
     "${splat[@]}" gradcheck tests/fixtures/*.safetensors --json "$folder/gradcheck.json"
-# All kernels of an image and its gradients, under NVIDIA's checker if CUDA's toolkit is there.
+# All kernels of an image and its gradients, under NVIDIA's checker if the CUDA toolkit is installed.
 if [[ $device == cuda ]] && command -v compute-sanitizer >/dev/null; then
     for tool in memcheck racecheck; do
         section "$tool" - compute-sanitizer --tool "$tool" --error-exitcode 1 \
@@ -190,10 +190,10 @@ if [[ -n $python ]]; then
     section "gsplat errors" "$folder/gsplat_errors.json" \
         "$python" benches/gsplat_errors.py tests/fixtures/*.safetensors \
         --ours "$folder/gradcheck.json" --json "$folder/gsplat_errors.json"
-    # A capture's first Gaussians, which are what `bench step` measures: here and with gsplat.
+    # A capture's initial Gaussians, as measured by `bench step`, here and with gsplat.
     beside_gsplat() {
         local name=$1 capture=$2 downscale=$3
-        # After one step a scene is still the first one.
+        # After one step the Gaussians are still the initial ones.
         section "first scene $name" - "${splat[@]}" train "$capture" --downscale "$downscale" --steps 1 --out "$folder/first_$name"
         section "rasterize first $name" "$folder/rasterize_first_$name.json" \
             "${splat[@]}" bench rasterize "$folder/first_$name/scene.ply" --capture "$capture" --downscale "$downscale" \

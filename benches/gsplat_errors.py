@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""gsplat's errors on this project's fixtures (tests/fixtures, float64 by PyTorch), beside those that `splat gradcheck` found.
+"""Compare gsplat's errors on this project's fixtures (tests/fixtures, PyTorch float64) with those of `splat gradcheck`.
 
     python benches/gsplat_errors.py tests/fixtures/*.safetensors --ours gradcheck.json --json errors.json
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from gsplat_side_by_side import read, write
 
-# What gsplat 1.x has in its kernels, by the names of the fixtures; fixtures within a thousandth of it ask the same.
+# Constants in the kernels of gsplat 1.x, by their names in the fixtures; values within a thousandth count as equal.
 THRESHOLDS = {"alpha_min": 1 / 255, "alpha_max": 0.99, "transmittance_min": 1e-4}
 GROUPS = ("means", "quats", "scales", "opacities", "sh0", "sh_rest", "viewmat", "background")
 INPUTS = ("means", "quats", "scales", "opacities", "sh_coeffs", "background", "viewmat")
@@ -27,7 +27,7 @@ KINDS = {"F32": "<f4", "F64": "<f8"}
 
 
 def read_fixture(path):
-    """Settings as text, and tensors by name, of a safetensors file."""
+    """Read a safetensors file: settings as text, and tensors by name."""
     data = read(path)
     try:
         length = struct.unpack_from("<Q", data)[0]
@@ -48,7 +48,7 @@ def read_fixture(path):
 
 
 def unsuitable(settings, tensors):
-    """Why gsplat cannot be asked this, or None."""
+    """Return why gsplat cannot run this fixture, or None."""
     if "depth" in tensors:
         return "it has depth"
     if not len(tensors["means"]):
@@ -60,13 +60,13 @@ def unsuitable(settings, tensors):
 
 
 def relative(found, expected):
-    """|found - expected| / |expected|; None where nothing is expected."""
+    """Return |found - expected| / |expected|, or None if nothing is expected."""
     norm = np.linalg.norm(expected)
     return float(np.linalg.norm(found - expected) / norm) if norm else None
 
 
 def errors(gsplat, torch, settings, tensors):
-    """Relative errors by group."""
+    """Return relative errors by group."""
     leaf = lambda values: torch.tensor(np.array(values), dtype=torch.float32, device="cuda", requires_grad=True)
     inputs = {name: leaf(tensors[name]) for name in INPUTS}
     inputs["viewmat"] = leaf(tensors["viewmat"].reshape(-1, 4, 4))
@@ -108,7 +108,7 @@ def errors(gsplat, torch, settings, tensors):
 
 
 def of_ours(path):
-    """The same of `splat gradcheck --json`, by file name."""
+    """Return the errors in the output of `splat gradcheck --json`, by file name."""
     if not path:
         return {}
     found = {}

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The same scene, views and losses with gsplat, beside what `splat bench` measured: forward, backward, training step.
+"""Compare gsplat with `splat bench` on the same scene, views and losses: forward, backward, training step.
 
     python benches/gsplat_side_by_side.py scene.ply capture/ --downscale 2 \
         --ours rasterize.json --ours-step step.json --json gsplat.json
@@ -24,7 +24,7 @@ from pathlib import Path
 
 import numpy as np
 
-# As `splat bench rasterize` has it.
+# As in `splat bench rasterize`.
 VIEWS = 8
 HOLD_OUT = 8
 ADAM_RATES = {"means": 1.6e-4, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3, "sh_rest": 1.25e-4}
@@ -38,7 +38,7 @@ def read(path):
 
 
 def write(path, text):
-    """All of it or nothing."""
+    """Write a file atomically."""
     whole = Path(f"{path}.tmp")
     try:
         whole.write_text(text)
@@ -48,7 +48,7 @@ def write(path, text):
 
 
 def read_ply(path):
-    """Fields of a binary little-endian PLY of floats, by name."""
+    """Read the fields of a binary little-endian PLY of floats, by name."""
     data = read(path)
     end = data.find(b"end_header\n")
     if end < 0:
@@ -75,7 +75,7 @@ def gaussians(path):
             "quats": stack([f"rot_{i}" for i in range(4)]),
             "opacities": ply["opacity"],
             "sh0": stack([f"f_dc_{i}" for i in range(3)])[:, None],
-            # The file has all of red, then green, then blue.
+            # The file stores red, then green, then blue.
             "sh_rest": coefficients.reshape(len(ply["x"]), 3, rest // 3).transpose(0, 2, 1),
         }
     except KeyError as missing:
@@ -83,7 +83,7 @@ def gaussians(path):
 
 
 def read_model(folder):
-    """(name, world-to-camera [4, 4], (fx, fy, cx, cy), (width, height)) of every photo, sorted by name."""
+    """Return (name, world-to-camera [4, 4], (fx, fy, cx, cy), (width, height)) of every photo, sorted by name."""
     model = Path(folder) / "sparse" / "0"
     cameras_bin, images_bin = read(model / "cameras.bin"), read(model / "images.bin")
     cameras, at = {}, 8
@@ -115,7 +115,7 @@ def read_model(folder):
 
 
 def train_views(folder, downscale):
-    """At most VIEWS of the training views, evenly spread; sizes and intrinsics divided by `downscale`."""
+    """Return at most VIEWS training views, evenly spread, with sizes and intrinsics divided by `downscale`."""
     views, split = read_model(folder), Path(folder) / "split.json"
     if split.exists():
         try:
@@ -132,12 +132,12 @@ def train_views(folder, downscale):
 
 
 def spread(seconds):
-    """Milliseconds: median, least, most."""
+    """Return median, smallest and largest time in milliseconds."""
     return {"median": 1e3 * statistics.median(seconds), "min": 1e3 * min(seconds), "max": 1e3 * max(seconds)}
 
 
 def ratio(gsplat, ours):
-    """How many times gsplat's time ours is: of the medians, and the ends of what both spreads allow."""
+    """Return our time as a multiple of gsplat's: of the medians, and the limits allowed by both spreads."""
     return {
         "median": ours["median"] / gsplat["median"],
         "min": ours["min"] / gsplat["max"],
@@ -277,7 +277,7 @@ def measure(scene, views, capture, downscale, passes, ours, ours_step):
         if row:
             times = result["ours_times_gsplat"]
             times["step"] = ratio(result["step_milliseconds"], row["milliseconds"])
-            # What was in use at most, ours as seen between stages; and what the allocators took from the device.
+            # Peak memory in use (ours between stages), and memory reserved by the allocators.
             times["memory in use"] = row["memory"]["most_bytes"] / result["peak_bytes"]
             times["memory reserved"] = row["memory"]["reserved_bytes"] / result["reserved_bytes"]
     return result

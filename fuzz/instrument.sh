@@ -1,6 +1,6 @@
 #!/bin/sh
-# A wrapper of rustc for cargo (RUSTC_WORKSPACE_WRAPPER): the two crates with readers get counters on every edge of
-# their control flow, and checks of overflow. Dependencies are not wrapped, and are not compiled again.
+# A rustc wrapper for cargo (RUSTC_WORKSPACE_WRAPPER) that compiles the two crates with readers with counters on every
+# edge of their control flow, and with overflow checks. Dependencies are not wrapped, and not compiled again.
 rustc=$1
 shift
 case " $* " in

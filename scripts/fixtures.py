@@ -17,7 +17,7 @@ The file, in the safetensors format:
     grad.x    its gradient; an input in `constants` has none
     y         an output (a single tensor is called `output`)
     grad_y    its upstream gradient
-    metadata  `outputs`: names of the outputs in order, with commas between; `case`: what it is
+    metadata  `outputs`: names of the outputs in order, separated by commas; `case`: a description
 
 All tensors are float64; a scalar has the shape [1].
 """
@@ -98,7 +98,7 @@ def weight(name, output, upstream, generator):
 
 
 def serialise(arrays, metadata):
-    """The bytes of a safetensors file: length of the header, header in JSON, tensors one after the other."""
+    """Return the bytes of a safetensors file: length of the header, JSON header, tensors."""
     header, data = {"__metadata__": dict(sorted(metadata.items()))}, b""
     for name, array in sorted(arrays.items()):
         raw = np.ascontiguousarray(array, dtype="<f8").tobytes()

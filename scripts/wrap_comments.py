@@ -1,13 +1,12 @@
 #!/usr/bin/env python3
 """Wraps comments of Rust files at 100 columns, the width of the code.
 
-rustfmt can do it on nightly only (`wrap_comments`, `comment_width`).
+rustfmt can do this on nightly only (`wrap_comments`, `comment_width`).
 
     scripts/wrap_comments.py            rewrites files
-    scripts/wrap_comments.py --check    names lines that are too long; exit status 1 if there are any
+    scripts/wrap_comments.py --check    lists files with lines that are too long; exit status 1 if there are any
 
-Only blocks with a line that is too long are touched. Code in fences, tables, headings and lines that are one long word
-(links) stay as they are.
+Only blocks with a line that is too long are changed. Fenced code, tables, headings and links are left alone.
 """
 
 import re
@@ -22,7 +21,7 @@ FIXED = re.compile(r"^\s*(\||#|\[[^\]]+\]:|<)")
 
 
 def wrapped(prefix, bodies):
-    """The lines of one block of comments, given what follows the marker on each."""
+    """Wrap one block of comments, given the text after the marker of each line."""
     out, paragraph, fenced = [], [], False
 
     def flush():

@@ -23,7 +23,7 @@ pub struct EvalArgs {
     pub capture: PathBuf,
     /// Scene: a PLY file in the 3DGS layout
     pub scene: PathBuf,
-    /// How the higher degrees of spherical harmonics are stored and read
+    /// Precision of the higher degrees of spherical harmonics
     #[arg(long, value_enum, default_value_t)]
     pub sh_precision: scene::PrecisionChoice,
     /// Views to measure

@@ -31,7 +31,7 @@ viewmat maps world to camera (+x right, +y down, +z forward); the first pixel's 
 pub struct RenderArgs {
     /// Scene: a PLY file in the 3DGS layout
     pub scene: PathBuf,
-    /// How the higher degrees of spherical harmonics are stored and read
+    /// Precision of the higher degrees of spherical harmonics
     #[arg(long, value_enum, default_value_t)]
     pub sh_precision: scene::PrecisionChoice,
     #[command(flatten)]
@@ -41,7 +41,7 @@ pub struct RenderArgs {
     /// Folder to write the pictures to
     #[arg(long, value_name = "DIR")]
     pub out: PathBuf,
-    /// What to render; depth is the mean depth of what is seen, nearest white, farthest black
+    /// Channels to render; depth is the mean visible depth, nearest white, farthest black
     #[arg(long, value_enum, value_delimiter = ',', default_value = "rgb")]
     channels: Vec<Channel>,
 }

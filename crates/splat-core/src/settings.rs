@@ -222,7 +222,7 @@ pub struct AdamStep {
     pub rate: f64,
     /// Added to the root of the second moment; epsilon times `sqrt(1 - beta_2^t)`.
     pub epsilon: f64,
-    /// Which rows take the step.
+    /// Rows that take the step.
     pub rows: AdamRows,
 }
 

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use crate::field::GAUSSIANS;
 
-/// Whether the moments of a row continue or restart.
+/// Treatment of the moments of a new row.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Moments {
     /// Moments of the source row.

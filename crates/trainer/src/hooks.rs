@@ -9,7 +9,7 @@ use splat_model::optimizer::StateRecord;
 use splat_model::strategy::StepInfo;
 use splat_ops::{OpError, Rendered};
 
-/// What a view is rendered for.
+/// Purpose of a render.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Purpose {
     /// Training.
@@ -25,7 +25,7 @@ pub struct HookView<'a> {
     pub training_index: Option<usize>,
     /// Name of its photo.
     pub name: &'a str,
-    /// What the view is rendered for.
+    /// Purpose of the render.
     pub purpose: Purpose,
 }
 

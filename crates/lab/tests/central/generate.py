@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""What PyTorch says of the ten functions of `ten.rs`: fixtures with gradients, and verdicts of torch.autograd.gradcheck.
+"""Write PyTorch's results for the ten functions of `ten.rs`: fixtures with gradients, and verdicts of torch.autograd.gradcheck.
 
     python3 crates/lab/tests/central/generate.py      # writes fixtures/*.safetensors and fixtures/verdicts.json
 
@@ -97,7 +97,7 @@ CASES = {
 
 
 def jacobian_errors(function, inputs):
-    """The largest error of PyTorch's numeric Jacobian beside its analytic one, relative to the largest entry."""
+    """Return the largest difference of PyTorch's numeric and analytic Jacobian, relative to the largest entry."""
     from torch.autograd.gradcheck import _get_analytical_jacobian, _get_numerical_jacobian
 
     leaves = tuple(x.clone().requires_grad_() for x in inputs.values())
@@ -130,7 +130,7 @@ def main():
     for name, (function, inputs) in CASES.items():
         entry = verdict(name, function, inputs)
         if name == "one_in_a_million":
-            # 32 MB in a fixture: a few of its gradients are enough here.
+            # The fixture would take 32 MB; a few of its gradients suffice.
             x = inputs["x"].clone().requires_grad_()
             (gradient,) = torch.autograd.grad(function(x).sum(), x)
             places = [0, 1, WRONG_AT - 1, WRONG_AT, WRONG_AT + 1, MILLION - 1]

@@ -30,7 +30,7 @@ pub enum CaptureError {
     NoModel {
         /// The capture's folder.
         root: PathBuf,
-        /// What the folder seems to contain instead, if anything.
+        /// Apparent contents of the folder, if any.
         hint: &'static str,
     },
     /// One of the three files of a model is missing.

@@ -21,7 +21,7 @@ use fields::{FieldVisitor, GradientsOf, Paths, Untracked, ValuesOf, change};
 /// Gradients by field name, each `[N, width]`; dimensions beyond the first are flattened.
 pub type FieldGradients = BTreeMap<String, Tensor<2>>;
 
-/// What the optimiser does with a field in a step.
+/// Action of the optimiser on a field in a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum FieldStep {
     /// A step, with the field's rate times this factor.
