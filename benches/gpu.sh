@@ -54,7 +54,7 @@ for capture in "${captures[@]}"; do
 done
 [[ $downscale =~ ^[1-9][0-9]*$ ]] || fail "--downscale must be a whole number from 1"
 case "$device" in
-    wgpu) features=() runs_on=wgpu ;;
+    wgpu) features=(--features wgpu) runs_on=wgpu ;;
     vulkan) features=(--features vulkan) runs_on=vulkan ;;
     cuda) features=(--features cuda) runs_on=cuda ;;
     *) fail "--device must be wgpu, vulkan or cuda" ;;

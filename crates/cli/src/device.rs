@@ -66,6 +66,11 @@ pub(super) fn open(global: &GlobalArgs) -> Result<ChosenDevice, Failure> {
             .or_else(|()| cpu().or_else(|_| wgpu("wgpu"))),
     }?;
     global.say(format_args!("device: {}", chosen.in_words()));
+    if global.device == DeviceChoice::Auto && !cfg!(any(feature = "wgpu", feature = "cuda")) {
+        global.say(
+            "note: this program was built for the CPU alone; built with `--features wgpu` it takes a GPU where there is one",
+        );
+    }
     let facts = device_info(&chosen.device).unwrap_or_default();
     if may_crash(&facts) {
         global.say(
