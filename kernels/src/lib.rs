@@ -4,10 +4,10 @@
 //! the pipeline. [`activation`], [`project`] and [`sh_colors`] (with [`sh`] for the harmonics) turn
 //! Gaussians into screen splats and colours; [`intersect`] lists the tiles that each splat touches,
 //! using [`scan`] and [`sort`]; [`rasterize`] blends each tile front to back; [`photometric`]
-//! compares the image with a photo. [`adam`] and [`screen_statistics`] complete a training step.
-//! [`ssim`] is similarity per pixel, [`blur`] a separable window, [`exp`] the exponential. [`work`]
-//! counts launches and memory, [`floor`] computes the unavoidable memory traffic, and [`copy`]
-//! measures memory bandwidth.
+//! compares the image with a photo. [`adam`], [`screen_statistics`] and [`perturb`] complete a
+//! training step. [`ssim`] is similarity per pixel, [`blur`] a separable window, [`exp`] the
+//! exponential. [`work`] counts launches and memory, [`floor`] computes the unavoidable memory
+//! traffic, and [`copy`] measures memory bandwidth.
 //!
 //! Functions take a CubeCL client and [`Buffer`]s of `f32` or `u32` (contiguous, row-major) and
 //! launch kernels without waiting, unless documented otherwise. The same input gives the same bits
@@ -28,6 +28,7 @@ pub mod floor;
 pub mod intersect;
 mod launch;
 mod math;
+pub mod perturb;
 pub mod photometric;
 mod planes;
 pub mod project;

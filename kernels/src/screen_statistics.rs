@@ -35,6 +35,7 @@ fn add_screen_statistics(
     half_height: f32,
     gaussians: u32,
     cameras: u32,
+    gradient_width: u32,
 ) {
     let gaussians = gaussians as usize;
     let gaussian = ABSOLUTE_POS;
@@ -42,8 +43,9 @@ fn add_screen_statistics(
         let mut sum = 0.0f32;
         let mut count = 0.0f32;
         for camera in 0..cameras as usize {
-            let at = (camera * gaussians + gaussian) * PROJECTED_WIDTH;
-            if packed[at + PROJECTED_EXTENT] > 0.0f32 {
+            let splat = camera * gaussians + gaussian;
+            if packed[splat * PROJECTED_WIDTH + PROJECTED_EXTENT] > 0.0f32 {
+                let at = splat * gradient_width as usize;
                 let x = gradient[at] * half_width;
                 let y = gradient[at + 1] * half_height;
                 let length = f32::sqrt(x * x + y * y);
@@ -56,9 +58,9 @@ fn add_screen_statistics(
     }
 }
 
-/// Gradients of packed splats and these themselves, both `[C, N, 9]`, and sums of lengths and of
-/// views, both `[N]`, to these sums with the lengths of `half * gradient` and the views added: in
-/// their own memory, where nothing else holds it.
+/// Adds the lengths of `half * gradient`, and the views, to sums of both, `[N]`: in their own
+/// memory, where nothing else holds it. Gradients are of packed splats `[C, N, 9]` or of screen
+/// means `[C, N, 2]`; the packed splats say which views see a Gaussian.
 pub fn screen_statistics(
     client: &Client,
     [gradient, packed]: [&Buffer; 2],
@@ -67,7 +69,8 @@ pub fn screen_statistics(
 ) -> [Buffer; 2] {
     let [lengths, views] = sums;
     let gaussians = lengths.len().min(views.len());
-    let cameras = gradient.len().min(packed.len()) / (PROJECTED_WIDTH * gaussians.max(1));
+    let cameras = packed.len() / (PROJECTED_WIDTH * gaussians.max(1));
+    let gradient_width = gradient.len() / (cameras * gaussians).max(1);
     let (lengths, [lengths_in, lengths_out]) = lengths.overwritten(client, 2);
     let (views, [views_in, views_out]) = views.overwritten(client, 3);
     if let Some((count, dim)) = per_element(gaussians) {
@@ -85,6 +88,7 @@ pub fn screen_statistics(
             half[1],
             gaussians as u32,
             cameras as u32,
+            gradient_width as u32,
         );
     }
     [lengths, views]

@@ -67,7 +67,7 @@ fn a_picture_keeps_the_bytes_that_are_stated() {
             assert!((stated..stated + 4096).contains(&used));
 
             let before = work().reserved_bytes;
-            let needs_grad = [true, true, true, false].into();
+            let needs_grad = [true, true, true, false, false].into();
             rasterize_vjp(
                 &client, &inputs, &state, &image, &frames, &settings, needs_grad,
             );

@@ -55,7 +55,7 @@ fn train_with(capture: &Arc<Capture>, device: &Device, seed: u64, deterministic:
     };
     config.density.every = 4;
     config.density.reset_every = 8;
-    config.density.grow_gradient = 1e-5;
+    config.density.grow_gradient = Some(1e-5);
     // More than the default for such small photos.
     config.density.max_gaussians = Some(10_000);
     Trainer::builder(capture.clone())

@@ -3,6 +3,7 @@
 
 pub mod exp;
 pub mod memory;
+pub mod noise;
 mod packed;
 mod settings;
 mod sh;
@@ -10,11 +11,11 @@ mod tensors;
 
 pub use packed::{PROJECTED_DEPTH, PROJECTED_EXTENT, PROJECTED_WIDTH, SPLAT_SIZE_MAX, TILE_SIDE};
 pub use settings::{
-    ALPHA_MIN, Activation, AdamRows, AdamStep, ClampGradient, ImageSize, ProjectSettings,
-    RasterizeSettings, ShColorSettings, SsimArgs,
+    ALPHA_MIN, Activation, AdamRows, AdamStep, ClampGradient, ImageSize, Perturbation,
+    ProjectSettings, RasterizeSettings, ShColorSettings, SsimArgs,
 };
 pub use sh::{SH_C0, SH_C1, SH_C2, SH_C3, SH_DEGREE_MAX, sh_coefficient_count};
 pub use tensors::{
-    AdamTensors, ProjectTensors, RasterizeTensors, ScreenStatisticsTensors, ShColorTensors,
-    SphericalHarmonicsTensors, SsimTensors,
+    AdamTensors, PerturbTensors, ProjectTensors, RasterizeTensors, ScreenStatisticsTensors,
+    ShColorTensors, SphericalHarmonicsTensors, SsimTensors,
 };

@@ -240,6 +240,34 @@ pub enum AdamRows {
     Seen,
 }
 
+/// The noise of one step of Langevin dynamics (Kheradmand et al. 2024, *3D Gaussian Splatting as
+/// Markov Chain Monte Carlo*, eq. 8 and 9).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Perturbation {
+    /// Factor of the noise of a Gaussian that is quite transparent, in 1 / world units.
+    pub amount: f64,
+    /// Opacity at which half of that is left.
+    pub opacity: f64,
+    /// How steeply it falls with the opacity.
+    pub steepness: f64,
+    /// Seed of the run.
+    pub seed: u64,
+    /// The step. Draws are a function of seed, step and row.
+    pub step: u32,
+}
+
+impl Perturbation {
+    /// Factor of the noise of a Gaussian of this opacity.
+    pub fn gate(&self, opacity: f64) -> f64 {
+        self.amount / (1.0 + (self.steepness * (opacity - self.opacity)).exp())
+    }
+
+    /// The words that the draws of a row are a hash of.
+    pub fn words(&self, row: u32) -> [u32; 4] {
+        [row, self.step, self.seed as u32, (self.seed >> 32) as u32]
+    }
+}
+
 /// Window and constants of structural similarity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SsimArgs {

@@ -161,6 +161,9 @@ tensors! {
     } optional {
         /// Colour behind all splats `[C, D]`; zero if there is none.
         background,
+        /// Leaf `[C, N, 2]` whose gradient is the sum over pixels of the absolute gradients of the
+        /// screen means. Its values are not read.
+        absgrad,
     }
 }
 
@@ -189,9 +192,23 @@ tensors! {
 }
 
 tensors! {
+    /// Tensors of `perturb_means`.
+    PerturbTensors {
+        /// World positions `[N, 3]`.
+        means,
+        /// Quaternions (w, x, y, z) of any length `[N, 4]`.
+        quats,
+        /// Logarithms of the scales `[N, 3]`.
+        log_scales,
+        /// Logits of the opacities `[N]`.
+        opacity_logits,
+    }
+}
+
+tensors! {
     /// Tensors of `ScreenStatistics::add`.
     ScreenStatisticsTensors {
-        /// Gradient of the packed splats `[C, N, 9]`.
+        /// Gradient of the packed splats `[C, N, 9]`, or of their screen means `[C, N, 2]`.
         gradient,
         /// Packed splats `[C, N, 9]`.
         packed,

@@ -16,12 +16,13 @@ use burn::backend::{
 use burn::backend::{Autodiff, Dispatch};
 
 use crate::settings::{
-    Activation, AdamStep, ProjectArgs, RasterizeArgs, ShColorSettings, SsimArgs,
+    Activation, AdamStep, Perturbation, ProjectArgs, RasterizeArgs, ShColorSettings, SsimArgs,
 };
 
 pub use splat_core::{
-    AdamTensors, PROJECTED_EXTENT, PROJECTED_WIDTH, ProjectTensors, RasterizeTensors,
-    ScreenStatisticsTensors, ShColorTensors, SphericalHarmonicsTensors, SsimTensors,
+    AdamTensors, PROJECTED_EXTENT, PROJECTED_WIDTH, PerturbTensors, ProjectTensors,
+    RasterizeTensors, ScreenStatisticsTensors, ShColorTensors, SphericalHarmonicsTensors,
+    SsimTensors,
 };
 
 /// Tensors of one op, in the form that Burn's dispatch carries.
@@ -85,6 +86,8 @@ inputs! {
     SsimInputs = SsimTensors<FloatTensor<B>>;
     /// Inputs of [`AdamOps`].
     AdamInputs = AdamTensors<FloatTensor<B>>;
+    /// Inputs of [`PerturbOps`].
+    PerturbInputs = PerturbTensors<FloatTensor<B>>;
     /// Inputs of [`ScreenStatisticsOps`].
     ScreenStatisticsInputs = ScreenStatisticsTensors<FloatTensor<B>>;
 }
@@ -335,6 +338,16 @@ pub trait AdamOps: Backend {
     fn adam(#[extension_type] inputs: AdamInputs<Self>, step: AdamStep) -> AdamOutputs<Self>;
 }
 
+/// [`perturb_means`](crate::perturb_means). Not differentiable.
+#[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
+pub trait PerturbOps: Backend {
+    /// The means after the noise.
+    fn perturb(
+        #[extension_type] inputs: PerturbInputs<Self>,
+        noise: Perturbation,
+    ) -> FloatTensor<Self>;
+}
+
 /// Everything that the ops need from a backend.
 pub trait SplatBackend:
     ProjectBackend
@@ -348,6 +361,7 @@ pub trait SplatBackend:
     + PhotometricBackend
     + ScreenStatisticsOps
     + AdamOps
+    + PerturbOps
 {
 }
 
@@ -363,5 +377,6 @@ impl<B> SplatBackend for B where
         + PhotometricBackend
         + ScreenStatisticsOps
         + AdamOps
+        + PerturbOps
 {
 }

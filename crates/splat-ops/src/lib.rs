@@ -18,6 +18,7 @@
 //! | [`exp`], [`sigmoid`] | activations of scales and opacities | the input |
 //! | [`adam_step`] | one step of Adam on one parameter | - |
 //! | [`ScreenStatistics`] | sums for density control | - |
+//! | [`perturb_means`] | noise on the means, for MCMC | - |
 //!
 //! ```
 //! use burn::tensor::{Device, Tensor};
@@ -92,6 +93,7 @@ pub mod cpu;
 mod cube;
 pub mod device;
 mod error;
+mod perturb;
 mod photometric;
 mod project;
 mod rasterize;
@@ -112,13 +114,14 @@ pub use cubecl;
 #[cfg(feature = "cpu")]
 pub use device::rasterize_work;
 pub use error::{ErrorSlot, OpError};
+pub use perturb::perturb_means;
 pub use photometric::{Photometric, Target, photometric, photometric_masked};
 pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};
 pub use screen_statistics::ScreenStatistics;
 pub use settings::{
-    Activation, AdamRows, AdamStep, ClampGradient, ImageSize, ProjectSettings, RasterizeSettings,
-    ShColorSettings, SsimArgs,
+    Activation, AdamRows, AdamStep, ClampGradient, ImageSize, Perturbation, ProjectSettings,
+    RasterizeSettings, ShColorSettings, SsimArgs,
 };
 pub use sh_colors::sh_colors;
 pub use spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count, spherical_harmonics};

@@ -17,6 +17,7 @@ use crate::{ImageSize, OpError, ProjectSettings};
 pub struct Projected {
     packed: Tensor<3>,
     size: ImageSize,
+    absgrad: Option<Tensor<3>>,
 }
 
 impl Projected {
@@ -34,7 +35,11 @@ impl Projected {
             "[C, N, 9]",
         )?;
         check_size(&check, size)?;
-        Ok(Self { packed, size })
+        Ok(Self {
+            packed,
+            size,
+            absgrad: None,
+        })
     }
 
     /// `[C, N, 9]`: mean x, mean y, depth, w11, w21, w22, compensation, extent x, extent y.
@@ -86,9 +91,53 @@ impl Projected {
             Dispatch::screen_probe(self.packed.into_dispatch(), probe.clone().into_dispatch());
         let probed = Self {
             packed: Tensor::from_dispatch(packed),
-            size: self.size,
+            ..self
         };
         (probed, probe)
+    }
+
+    /// The same splats, and a leaf `[C, N, 2]` whose gradient, after the backward pass of a
+    /// [`rasterize`](crate::rasterize()) of them, is the sum over pixels of the absolute value of
+    /// each pixel's gradient by the screen mean, x and y apart, in 1 / pixels (Ye et al. 2024,
+    /// *AbsGS: Recovering Fine Details for 3D Gaussian Splatting*, eq. 9). Where pixels pull a
+    /// splat apart, their gradients cancel in that of the mean; here they add up.
+    ///
+    /// It costs two sums per pixel and splat in the backward pass; splats without the leaf pay
+    /// nothing. Rasterised several times, they have the sum of the sums.
+    ///
+    /// ```
+    /// use burn::tensor::{Device, Tensor};
+    /// use splat_ops::{ImageSize, Projected, RasterizeSettings, rasterize};
+    ///
+    /// let device = Device::flex().autodiff();
+    /// let packed = [[[8.0, 8.0, 1.0, 0.5, 0.0, 0.5, 1.0, 6.0, 6.0]]];
+    /// let size = ImageSize { width: 16, height: 16 };
+    /// let packed = Tensor::<3>::from_floats(packed, &device).require_grad();
+    /// let (splats, absgrad) = Projected::from_packed(packed.clone(), size)?.with_absgrad();
+    /// let colors = Tensor::<2>::from_floats([[1.0]], &device);
+    /// let opacities = Tensor::<1>::from_floats([0.8], &device);
+    /// let rendered = rasterize(&splats, colors, opacities, None, &RasterizeSettings::default())?;
+    /// let gradients = rendered.image().sum().backward();
+    /// let of_mean = packed.grad(&gradients).unwrap().into_data().try_into_vec::<f32>().unwrap();
+    /// let absolute = absgrad.grad(&gradients).unwrap().into_data().try_into_vec::<f32>().unwrap();
+    /// assert!(of_mean[0].abs() < 1e-4); // Left and right cancel.
+    /// assert!(absolute[0] > 1.0);
+    /// # Ok::<(), splat_ops::OpError>(())
+    /// ```
+    pub fn with_absgrad(self) -> (Self, Tensor<3>) {
+        let [c, n, _] = self.packed.dims();
+        let options = (&self.packed.device(), self.packed.dtype());
+        let leaf = Tensor::zeros([c, n, 2], options).require_grad();
+        let probed = Self {
+            absgrad: Some(leaf.clone()),
+            ..self
+        };
+        (probed, leaf)
+    }
+
+    /// The leaf of [`with_absgrad`](Self::with_absgrad).
+    pub(crate) fn absgrad(&self) -> Option<Tensor<3>> {
+        self.absgrad.clone()
     }
 
     fn columns(&self, start: usize, length: usize) -> Tensor<3> {
@@ -174,6 +223,7 @@ pub fn project(
     Ok(Projected {
         packed: Tensor::from_dispatch(packed),
         size,
+        absgrad: None,
     })
 }
 

@@ -70,7 +70,8 @@ impl Rendered {
 /// Splats are ordered by depth, ties by index. Per pixel `alpha = min(alpha_max, o exp(-sigma))`; a
 /// splat with less than `alpha_min` is skipped, and the pixel stops before its transmittance would
 /// fall below `transmittance_min`. Every splat that was blended gets gradients, to screen mean,
-/// inverse Cholesky factor, colour and opacity; depth and extent only order and cull.
+/// inverse Cholesky factor, colour and opacity; depth and extent only order and cull. Splats
+/// [`with_absgrad`](Projected::with_absgrad) get the absolute gradients of their means too.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};
@@ -121,6 +122,7 @@ pub fn rasterize<const DC: usize, const DO: usize>(
         colors: colors.into_dispatch(),
         opacities: opacities.into_dispatch(),
         background: background.map(Tensor::into_dispatch),
+        absgrad: projected.absgrad().map(Tensor::into_dispatch),
     });
     let args = RasterizeArgs {
         size: projected.image_size(),

@@ -18,10 +18,11 @@ pub struct ScreenStatistics {
 }
 
 impl ScreenStatistics {
-    /// Adds a step: splats, and the gradient of their packed rows `[C, N, 9]`, of a loss that is a
-    /// mean over C cameras, as [`Projected::with_screen_probe`] hears it. Its first two columns
-    /// count, in 1 / pixels, where the extent says that a camera sees the Gaussian. A gradient that
-    /// is not finite counts as zero. One pass over memory, in place where nothing else holds the
+    /// Adds a step: splats, and the gradient of a loss that is a mean over C cameras, either of
+    /// their packed rows `[C, N, 9]`, as [`Projected::with_screen_probe`] gives it, or of their
+    /// screen means `[C, N, 2]`, as [`Projected::with_absgrad`] does. The first two columns count,
+    /// in 1 / pixels, where the extent says that a camera sees the Gaussian. A gradient that is not
+    /// finite counts as zero. One pass over memory, in place where nothing else holds the
     /// statistics. Not differentiable.
     ///
     /// # Errors
@@ -30,9 +31,11 @@ impl ScreenStatistics {
         // Autodiff has no part in this.
         let (gradient, packed) = (gradient.inner(), projected.packed().inner());
         let check = Checker::new("ScreenStatistics::add", "gradient", &gradient)?;
-        let [c, n, _] = gradient.dims();
+        let [c, n, width] = gradient.dims();
         let rows = [Some(c), Some(n), Some(PROJECTED_WIDTH)];
-        check.tensor("gradient", &gradient, rows, "[C, N, 9]")?;
+        if width != 2 {
+            check.tensor("gradient", &gradient, rows, "[C, N, 9] or [C, N, 2]")?;
+        }
         check.tensor("projected", &packed, rows, "[C, N, 9]")?;
         check.tensor("gradients", &self.gradients, [Some(n)], "[N]")?;
         check.tensor("views", &self.views, [Some(n)], "[N]")?;

@@ -1,8 +1,8 @@
 //! Sizes and settings of the ops. Every constant of the method is a field with a default.
 
 pub use splat_core::{
-    Activation, AdamRows, AdamStep, ClampGradient, ImageSize, ProjectSettings, RasterizeSettings,
-    ShColorSettings, SsimArgs,
+    Activation, AdamRows, AdamStep, ClampGradient, ImageSize, Perturbation, ProjectSettings,
+    RasterizeSettings, ShColorSettings, SsimArgs,
 };
 
 use crate::ErrorSlot;

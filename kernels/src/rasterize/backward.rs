@@ -9,6 +9,9 @@
 //! Each block sums its pixels, and the tile its blocks (in order). One value of an intersection
 //! goes to its slot, or is added to the splat's gradient at once.
 //!
+//! Where absolute gradients of the mean are asked for, two sums more: `Σ |g (w11 z1 + w21 z2)|` and
+//! `Σ |g w22 z2|`.
+//!
 //! Floor per (block, splat) pair: as forward, plus 24 bytes and 4 per channel to shared memory; per
 //! pixel of the block about 45 operations and 4 per channel. Per intersection: 32 bytes and 4 per
 //! channel from memory (28 without slots), and what `sums.rs` counts.
@@ -88,8 +91,14 @@ fn walk_group(
     pixels: &mut Pixels,
     batch: &Batch,
     partials: &mut Shared<[f32]>,
+    colors: &[f32],
+    grad_output: &[f32],
+    splats: &[u32],
+    start: u32,
     from: u32,
     remaining: u32,
+    channels: usize,
+    grid: Grid,
     place: Place,
     thresholds: Thresholds,
     #[comptime] plan: Plan,
@@ -107,7 +116,24 @@ fn walk_group(
         let k = (from + in_group) as usize;
         let entry = remaining - 1u32 - k as u32;
         let at = k * comptime!(SHAPE + width);
-        let mut parts = pixels.gradients(&batch.splats, at, entry, place, thresholds, plan, layout);
+        let mut splat = 0usize;
+        if comptime!(layout.reads_all_channels()) {
+            splat = splats[(start + entry) as usize] as usize;
+        }
+        let mut parts = pixels.gradients(
+            &batch.splats,
+            at,
+            entry,
+            colors,
+            grad_output,
+            splat,
+            channels,
+            grid,
+            place,
+            thresholds,
+            plan,
+            layout,
+        );
         // All units of a plane are here together: they walk the same block.
         if comptime!(plan.lanes() > 1) {
             #[unroll]
@@ -240,7 +266,7 @@ pub(super) fn rasterize_backward<A: Numeric>(
         channels,
         first_channel,
         plan,
-        width,
+        layout,
         first_launch,
     );
     let start = first_of_tile(ranges, grid, place);
@@ -278,8 +304,14 @@ pub(super) fn rasterize_backward<A: Numeric>(
                 &mut pixels,
                 &batch,
                 &mut partials,
+                colors,
+                grad_output,
+                splats,
+                start,
                 from,
                 remaining,
+                channels as usize,
+                grid,
                 place,
                 thresholds,
                 plan,

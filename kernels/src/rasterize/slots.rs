@@ -7,6 +7,9 @@ use super::tile::{BATCH, Plan, WORDS};
 /// follow.
 pub(super) const SHAPE_GRADIENTS: usize = SHAPE;
 
+/// Absolute gradients of a splat's screen mean, x and y.
+pub(super) const ABSOLUTE: usize = 2;
+
 /// Floats in the shared memory that every device has.
 const SHARED: usize = 16_384 / 4;
 /// Most floats of partial sums in it, where the batch leaves as many.
@@ -17,6 +20,8 @@ const MAX_PARTIALS: usize = 2304;
 pub(super) struct SlotLayout {
     /// Gradients of shape and opacity, [`SHAPE_GRADIENTS`] of them, come first.
     pub shape: bool,
+    /// Then absolute gradients of the mean, [`ABSOLUTE`] of them.
+    pub absolute: bool,
     /// Then those of the colours.
     pub colors: bool,
     /// Channels of this launch.
@@ -29,7 +34,17 @@ impl SlotLayout {
     }
 
     pub fn first_color(self) -> usize {
+        self.first_absolute() + if self.absolute { ABSOLUTE } else { 0 }
+    }
+
+    pub fn first_absolute(self) -> usize {
         if self.shape { SHAPE_GRADIENTS } else { 0 }
+    }
+
+    /// Whether the launch is for absolute gradients alone. They need all channels of a pixel at
+    /// once, so a launch that has not all of them reads them from memory.
+    pub fn reads_all_channels(self) -> bool {
+        self.absolute && !self.shape
     }
 
     /// Floats in shared memory beside the partial sums: the batch, its targets and bits, and how
@@ -57,9 +72,17 @@ mod tests {
         for lanes in [1, 8, 16, 32, 64] {
             let plan = Plan::with_lanes(lanes);
             for width in 1..=plan.channels() {
-                for (shape, colors) in [(true, true), (true, false), (false, true)] {
+                for (shape, absolute, colors) in [
+                    (true, true, true),
+                    (true, false, true),
+                    (true, true, false),
+                    (true, false, false),
+                    (false, false, true),
+                    (false, true, false),
+                ] {
                     let layout = SlotLayout {
                         shape,
+                        absolute,
                         colors,
                         width,
                     };

@@ -11,9 +11,9 @@ use cubecl::client::Client;
 use cubecl::features::AtomicUsage;
 use cubecl::ir::Type;
 use cubecl::prelude::*;
-use splat_core::PROJECTED_WIDTH;
+use splat_core::{PROJECTED_EXTENT, PROJECTED_WIDTH};
 
-use super::slots::SlotLayout;
+use super::slots::{ABSOLUTE, SlotLayout};
 
 /// How gradients of one splat from many tiles are summed.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -102,6 +102,11 @@ pub(super) fn add_to_splat<A: Numeric>(
         if comptime!(layout.colors) {
             add(&gradients.colors[splat * channels + channel], sum, sums);
         }
+    } else if value >= comptime!(layout.first_absolute()) {
+        if comptime!(layout.absolute) {
+            let at = absolute_entry(splat, value, layout);
+            add(&gradients.packed[at], sum, sums);
+        }
     } else if comptime!(layout.shape) {
         if value == 5 {
             add(&gradients.opacities[splat], sum, sums);
@@ -120,6 +125,25 @@ pub(super) fn add_to_splat<A: Numeric>(
 #[cube]
 fn packed_entry(value: usize) -> usize {
     select(value < 2, value, value + 1)
+}
+
+/// Where an absolute gradient of the mean waits among the gradients of packed splats: in the place
+/// of that of the extent, which has none. [`take_absolute`] takes it out. A buffer of its own would
+/// be one more than many devices can bind.
+#[cube]
+fn absolute_entry(splat: usize, value: usize, #[comptime] layout: SlotLayout) -> usize {
+    splat * PROJECTED_WIDTH + PROJECTED_EXTENT + value - comptime!(layout.first_absolute())
+}
+
+/// Moves the absolute gradients of the means out of the gradients of the extents, and clears these.
+#[cube(launch)]
+pub(super) fn take_absolute(grad_packed: &mut [f32], absgrad: &mut [f32], values: u32) {
+    if ABSOLUTE_POS < values as usize {
+        let at = ABSOLUTE_POS / ABSOLUTE * PROJECTED_WIDTH + PROJECTED_EXTENT;
+        let at = at + ABSOLUTE_POS % ABSOLUTE;
+        absgrad[ABSOLUTE_POS] = grad_packed[at];
+        grad_packed[at] = 0.0f32;
+    }
 }
 
 /// Sums the slots of every visible splat in order, and spreads them over the gradients; those of
@@ -198,6 +222,10 @@ fn spread(
         if comptime!(layout.colors) {
             grad_colors[splat * channels + channel] = sum;
         }
+    } else if value >= comptime!(layout.first_absolute()) {
+        if comptime!(layout.absolute) {
+            grad_packed[absolute_entry(splat, value, layout)] = sum;
+        }
     } else if comptime!(layout.shape) {
         let at = splat * PROJECTED_WIDTH + packed_entry(value);
         if comptime!(first_launch) {
@@ -206,8 +234,9 @@ fn spread(
             } else {
                 grad_packed[at] = sum;
             }
-            if value < 4 {
-                // The entries without gradient: depth, compensation, extents.
+            // The entries without gradient: depth, compensation, and the extents unless absolute
+            // gradients wait there.
+            if value < comptime!(if layout.absolute { 2usize } else { 4usize }) {
                 grad_packed[splat * PROJECTED_WIDTH + select(value == 0, 2usize, value + 5)] =
                     0.0f32;
             }

@@ -6,8 +6,8 @@ use splat_core::{PROJECTED_WIDTH, RasterizeTensors};
 use super::background::background_gradient;
 use super::backward::rasterize_backward;
 use super::pair::thresholds;
-use super::slots::{SHAPE_GRADIENTS, SlotLayout};
-use super::sums::{SlotTargetLaunch, SplatTargetLaunch, TargetArgs, sum_slots};
+use super::slots::{ABSOLUTE, SHAPE_GRADIENTS, SlotLayout};
+use super::sums::{SlotTargetLaunch, SplatTargetLaunch, TargetArgs, sum_slots, take_absolute};
 use super::tile::Plan;
 use super::{RasterizeInputs, RasterizeSettings, RasterizeState, Sums};
 use crate::intersect::{Frames, Slots};
@@ -15,10 +15,11 @@ use crate::launch::{Buffer, cube_count, per_element};
 
 /// Most channels of one launch of the backward pass, of `most` that it could do: the slots of all
 /// intersections must fit into a buffer of `bytes`, and within reach of an index.
-fn slot_channels(most: usize, bytes: u64, intersections: usize) -> usize {
+fn slot_channels(most: usize, bytes: u64, intersections: usize, absolute: bool) -> usize {
     let floats = (bytes / 4).min(u64::from(u32::MAX));
     let values = (floats / intersections.max(1) as u64) as usize;
-    values.saturating_sub(SHAPE_GRADIENTS).clamp(1, most)
+    let shape = SHAPE_GRADIENTS + if absolute { ABSOLUTE } else { 0 };
+    values.saturating_sub(shape).clamp(1, most)
 }
 
 #[cube(launch)]
@@ -36,9 +37,9 @@ fn zeros(client: &Client, len: usize) -> Buffer {
     buffer
 }
 
-/// Gradients of packed splats [C, N, 9], colours [C, N, D], opacities [C, N] and background [C, D]
-/// for the gradient of the output [C, H, W, D + 1]; only those that `needs_grad` names. In order if
-/// `state` has slots.
+/// Gradients of packed splats [C, N, 9], colours [C, N, D], opacities [C, N] and background [C, D],
+/// and absolute gradients of the screen means [C, N, 2], for the gradient of the output [C, H, W,
+/// D + 1]; only those that `needs_grad` names. In order if `state` has slots.
 pub fn rasterize_vjp(
     client: &Client,
     inputs: &RasterizeInputs,
@@ -51,6 +52,7 @@ pub fn rasterize_vjp(
     let splats = frames.splats();
     let channels = inputs.channels;
     let shape = needs_grad.packed || needs_grad.opacities;
+    let absolute = needs_grad.absgrad;
     let lists = &state.lists;
     let sums = match lists.slots {
         Some(_) => Sums::Ordered,
@@ -63,24 +65,41 @@ pub fn rasterize_vjp(
         Sums::Atomic | Sums::Exchange => zeros(client, len),
     };
     let gradients = [
-        reserve(shape, splats * PROJECTED_WIDTH),
+        reserve(shape || absolute, splats * PROJECTED_WIDTH),
         reserve(needs_grad.colors, splats * channels),
         reserve(shape, splats),
     ];
 
-    if shape || needs_grad.colors {
+    if shape || needs_grad.colors || absolute {
         let plan = Plan::new(client);
         let page = client.properties().memory.max_page_size;
         let width = match sums {
-            Sums::Ordered => slot_channels(plan.channels(), page, lists.intersections),
+            Sums::Ordered => slot_channels(plan.channels(), page, lists.intersections, absolute),
             Sums::Atomic | Sums::Exchange => plan.channels(),
         };
-        for first_channel in (0..channels).step_by(width) {
-            let layout = SlotLayout {
-                shape,
-                colors: needs_grad.colors,
-                width: width.min(channels - first_channel),
-            };
+        // Absolute gradients need all channels at once. Where the others go in several launches, or
+        // are not asked for, these have one of their own.
+        let together = absolute && shape && width >= channels;
+        let firsts = (0..channels).step_by(width);
+        let layouts = firsts
+            .filter(|_| shape || needs_grad.colors)
+            .map(|first_channel| {
+                let layout = SlotLayout {
+                    shape,
+                    absolute: together,
+                    colors: needs_grad.colors,
+                    width: width.min(channels - first_channel),
+                };
+                (layout, first_channel)
+            });
+        let alone = SlotLayout {
+            shape: false,
+            absolute: true,
+            colors: false,
+            width: 1,
+        };
+        let alone = (absolute && !together).then_some((alone, 0));
+        for (layout, first_channel) in layouts.chain(alone) {
             let launch = Launch {
                 client,
                 inputs,
@@ -100,12 +119,28 @@ pub fn rasterize_vjp(
         }
     }
     let [grad_packed, grad_colors, grad_opacities] = gradients;
+    let grad_absolute = absolute.then(|| {
+        let len = splats * ABSOLUTE;
+        let taken = Buffer::empty(client, len);
+        if let Some((count, dim)) = per_element(len) {
+            take_absolute::launch(
+                client,
+                count,
+                dim,
+                grad_packed.arg(),
+                taken.arg(),
+                len as u32,
+            );
+        }
+        taken
+    });
     RasterizeTensors {
         packed: needs_grad.packed.then_some(grad_packed),
         colors: needs_grad.colors.then_some(grad_colors),
         opacities: needs_grad.opacities.then_some(grad_opacities),
         background: (needs_grad.background && inputs.background.is_some())
             .then(|| background_gradient(client, state, grad_output, channels, frames)),
+        absgrad: grad_absolute,
     }
 }
 
@@ -197,14 +232,18 @@ mod tests {
 
     #[test]
     fn the_more_intersections_the_fewer_channels_at_once() {
-        assert_eq!(slot_channels(32, 1 << 40, 0), 32);
-        assert_eq!(slot_channels(32, 1 << 40, 1_000_000), 32);
-        assert_eq!(slot_channels(32, 1 << 40, MAX_INTERSECTIONS as usize), 16);
+        assert_eq!(slot_channels(32, 1 << 40, 0, false), 32);
+        assert_eq!(slot_channels(32, 1 << 40, 1_000_000, false), 32);
+        assert_eq!(
+            slot_channels(32, 1 << 40, MAX_INTERSECTIONS as usize, false),
+            16
+        );
         // 128 MiB: 33 floats for each of a million intersections, 3 for each of eleven million.
-        assert_eq!(slot_channels(32, 1 << 27, 1_000_000), 27);
-        assert_eq!(slot_channels(32, 1 << 27, 11_000_000), 1);
+        assert_eq!(slot_channels(32, 1 << 27, 1_000_000, false), 27);
+        assert_eq!(slot_channels(32, 1 << 27, 11_000_000, false), 1);
         for intersections in [1, 1000, 1 << 20, MAX_INTERSECTIONS] {
-            let values = SHAPE_GRADIENTS + slot_channels(32, 1 << 40, intersections as usize);
+            let values =
+                SHAPE_GRADIENTS + slot_channels(32, 1 << 40, intersections as usize, false);
             assert!(intersections * values as u64 <= u64::from(u32::MAX));
         }
     }

@@ -1,8 +1,11 @@
 //! Tests of blending and its gradients.
 
+use cubecl::client::Client;
+use splat_kernels::Buffer;
 use splat_kernels::intersect::Frames;
 use splat_kernels::rasterize::{
-    RasterizeInputs, RasterizeSettings, Sums, count_evaluations, rasterize, rasterize_vjp,
+    RasterizeInputs, RasterizeSettings, RasterizeState, Sums, count_evaluations, rasterize,
+    rasterize_vjp,
 };
 
 use crate::device::{
@@ -17,6 +20,31 @@ const SETTINGS: RasterizeSettings = RasterizeSettings {
 };
 
 const ALL_SUMS: [Sums; 3] = [Sums::Ordered, Sums::Atomic, Sums::Exchange];
+
+/// Gradients of packed splats, colours, opacities and background, without absolute ones.
+fn gradients(
+    client: &Client,
+    inputs: &RasterizeInputs,
+    state: &RasterizeState,
+    grad_output: &Buffer,
+    frames: &Frames,
+    settings: &RasterizeSettings,
+    [packed, colors, opacities, background]: [bool; 4],
+) -> [Option<Buffer>; 4] {
+    let needs_grad = [packed, colors, opacities, background, false].into();
+    let gradients = rasterize_vjp(
+        client,
+        inputs,
+        state,
+        grad_output,
+        frames,
+        settings,
+        needs_grad,
+    );
+    let [packed, colors, opacities, background, absgrad] = gradients.into();
+    assert!(absgrad.is_none(), "nobody asked for absolute gradients");
+    [packed, colors, opacities, background]
+}
 
 struct Scene {
     frames: Frames,
@@ -138,16 +166,15 @@ fn check(name: &str, scene: &Scene, limit: f64) {
             &image,
             1e-6,
         );
-        let grads: [_; 4] = rasterize_vjp(
+        let grads = gradients(
             &client,
             &inputs,
             &state,
             &grad_output,
             &scene.frames,
             &settings,
-            [true; 4].into(),
-        )
-        .into();
+            [true; 4],
+        );
         for (which, part) in ["packed", "colors", "opacities", "background"]
             .iter()
             .enumerate()
@@ -219,16 +246,15 @@ fn the_cap_of_alpha_stops_the_gradient_through_it() {
     let inputs = scene.inputs(&client);
     let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
     let grad = upload(&client, &[1.0, 1.0]);
-    let [packed, colors, opacities, background]: [_; 4] = rasterize_vjp(
+    let [packed, colors, opacities, background] = gradients(
         &client,
         &inputs,
         &state,
         &grad,
         &scene.frames,
         &SETTINGS,
-        [true; 4].into(),
-    )
-    .into();
+        [true; 4],
+    );
     assert_close("alpha", &download(&client, &output)[1..], &[0.99], 1e-6);
     assert_eq!(download(&client, &packed.unwrap()), [0.0; 9]);
     assert_eq!(download(&client, &opacities.unwrap()), [0.0]);
@@ -263,16 +289,15 @@ fn many_faint_layers_keep_their_transmittance() {
         1e-5,
     );
     let weights = uniform(&mut rng(38), output.len(), 0.0, 1.0);
-    let [_, colors, ..]: [_; 4] = rasterize_vjp(
+    let [_, colors, ..] = gradients(
         &client,
         &inputs,
         &state,
         &upload(&client, &weights),
         &scene.frames,
         &SETTINGS,
-        [false, true, false, false].into(),
-    )
-    .into();
+        [false, true, false, false],
+    );
     // dL/dcolour_i = Σ over pixels of T_i alpha_i g: the image is linear in the colours.
     let (packed, opacities) = (&wide_scene[0], &wide_scene[2]);
     let mut expected = vec![0.0; 2000];
@@ -311,16 +336,15 @@ fn nothing_to_see_gives_the_background() {
         scene.reference(&scene.wide())
     );
     let grad = upload(&client, &vec![1.0; output.len()]);
-    let grads: [_; 4] = rasterize_vjp(
+    let grads = gradients(
         &client,
         &inputs,
         &state,
         &grad,
         &scene.frames,
         &SETTINGS,
-        [true; 4].into(),
-    )
-    .into();
+        [true; 4],
+    );
     let [packed, colors, opacities, background] = grads.map(|g| download(&client, &g.unwrap()));
     assert!(packed.is_empty() && colors.is_empty() && opacities.is_empty());
     assert_eq!(background, [95.0; 4]);
@@ -336,16 +360,15 @@ fn only_the_wanted_gradients_and_the_same_bits_every_time() {
         let settings = RasterizeSettings { sums, ..SETTINGS };
         let (output, state) = rasterize(&client, &inputs, &scene.frames, &settings).unwrap();
         let grad = upload(&client, &weights);
-        let grads: [_; 4] = rasterize_vjp(
+        let grads = gradients(
             &client,
             &inputs,
             &state,
             &grad,
             &scene.frames,
             &settings,
-            needs_grad.into(),
-        )
-        .into();
+            needs_grad,
+        );
         (
             download(&client, &output),
             grads.map(|g| g.map(|g| download(&client, &g))),
@@ -402,16 +425,15 @@ fn sums_of_thousands_of_tiles_lose_nothing() {
         let (_, state) = rasterize(&client, &inputs, &scene.frames, &settings).unwrap();
         assert_eq!(state.lists.intersections, 3 * 64 * 64);
         assert_eq!(state.lists.slots.is_some(), sums == Sums::Ordered);
-        let [packed, colors, ..]: [_; 4] = rasterize_vjp(
+        let [packed, colors, ..] = gradients(
             &client,
             &inputs,
             &state,
             &grad,
             &scene.frames,
             &settings,
-            [true; 4].into(),
-        )
-        .into();
+            [true; 4],
+        );
         [packed, colors].map(|grad| download(&client, &grad.unwrap()))
     });
     let [packed, colors] = ordered;
@@ -444,16 +466,15 @@ fn more_tiles_than_one_dimension_of_workgroups_can_hold() {
     let expected = scene.reference(&scene.wide());
     assert_close("image", &download(&client, &output), &expected, 1e-6);
     let grad = upload(&client, &vec![1.0; output.len()]);
-    let [_, colors, ..]: [_; 4] = rasterize_vjp(
+    let [_, colors, ..] = gradients(
         &client,
         &inputs,
         &state,
         &grad,
         &scene.frames,
         &SETTINGS,
-        [false, true, false, false].into(),
-    )
-    .into();
+        [false, true, false, false],
+    );
     // One splat of colour 1 lights all pixels: the sum of its weights.
     let expected: Vec<f64> = (0..3)
         .map(|n| {
@@ -556,16 +577,15 @@ fn time_of_the_stages_at_270_by_480() {
         let (output, state) = rasterize(&client, &inputs, &scene.frames, &SETTINGS).unwrap();
         download(&client, &output);
         lap("intersect + forward");
-        let grads: [_; 4] = rasterize_vjp(
+        let grads = gradients(
             &client,
             &inputs,
             &state,
             &grad,
             &scene.frames,
             &SETTINGS,
-            [true; 4].into(),
-        )
-        .into();
+            [true; 4],
+        );
         download(&client, grads[2].as_ref().unwrap());
         lap("backward");
         println!("{} intersections", lists.intersections);

@@ -130,6 +130,7 @@ pub(super) fn judge(
         scene: scene.clone(),
         expected: reference.outputs,
         gradients: reference.gradients,
+        absgrad: reference.absgrad,
     };
     let report = compare(&fixture, ours, Precision::F32, walked.near_threshold);
     let (worst_group, gradient) = report.worst_group();

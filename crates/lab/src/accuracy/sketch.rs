@@ -212,6 +212,7 @@ impl Sketch {
                 alpha,
                 depth,
             },
+            absgrad: true,
         }
     }
 }

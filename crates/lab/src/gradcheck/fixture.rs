@@ -29,6 +29,9 @@ const INPUTS: [&str; 8] = [
 /// Images. The upstream gradient of each is named `grad_` and its name.
 const PICTURES: [&str; 3] = ["image", "alpha", "depth"];
 
+/// Optional absolute gradients of the reference.
+const ABSGRAD: &str = "absgrad";
+
 /// A validated fixture.
 #[derive(Debug, Clone)]
 pub struct Fixture {
@@ -43,6 +46,9 @@ pub struct Fixture {
     pub expected: Outputs,
     /// Gradients of the reference's autograd.
     pub gradients: Inputs,
+    /// Sums over pixels of the absolute gradients of the screen means, `[N, 2]` or `[C, N, 2]`,
+    /// if the file has them.
+    pub absgrad: Option<Array>,
 }
 
 impl Fixture {
@@ -174,6 +180,9 @@ impl Reader<'_> {
 
         let (project, rasterize) = self.metadata.settings()?;
         let scene_inputs = inputs("")?;
+        let absgrad = has(ABSGRAD)
+            .then(|| self.exactly(ABSGRAD, &with(&[n, 2])))
+            .transpose()?;
         self.check_ranges(&scene_inputs)?;
         let scene = Scene {
             source: self.file.to_path_buf(),
@@ -186,6 +195,7 @@ impl Reader<'_> {
             rasterize,
             inputs: scene_inputs,
             upstream,
+            absgrad: absgrad.is_some(),
         };
         Ok(Fixture {
             case: self.metadata.case(),
@@ -193,6 +203,7 @@ impl Reader<'_> {
             scene,
             expected,
             gradients: inputs("grad.")?,
+            absgrad,
         })
     }
 
@@ -229,11 +240,10 @@ impl Reader<'_> {
         for name in names {
             let input = name.strip_prefix("grad.").unwrap_or(name);
             let picture = name.strip_prefix("grad_").unwrap_or(name);
-            if INPUTS.contains(&input) || PICTURES.contains(&picture) {
+            if INPUTS.contains(&input) || PICTURES.contains(&picture) || name == ABSGRAD {
                 continue;
             }
             let reason = match input {
-                "absgrad" => "cannot be checked yet; remove it",
                 "distortion" => "is too many: the camera model `pinhole` has no distortion",
                 "domain" => "is too many: the camera model `pinhole` has no domain",
                 _ => "is not part of the format; remove it, or correct its name",

@@ -81,7 +81,8 @@ pub struct FileReport {
     pub hard: bool,
     /// Largest relative L2 error that passes.
     pub gate: f64,
-    /// Groups: means, quats, scales, opacities, sh0, sh_rest, viewmat, intrinsics, background.
+    /// Groups: means, quats, scales, opacities, sh0, sh_rest, viewmat, intrinsics, background and,
+    /// if the fixture has it, absgrad.
     pub groups: Vec<GroupReport>,
     /// Images: image, alpha and, if the fixture has it, depth.
     pub outputs: Vec<OutputReport>,
@@ -136,12 +137,27 @@ pub fn compare(
         .zip(&inputs)
         .map(|(r, x)| norm(&r.array.values) * size(&x.array))
         .fold(0.0, f64::max);
-    let groups: Vec<_> = ours
+    let mut groups: Vec<_> = ours
         .iter()
         .zip(&reference)
         .zip(&inputs)
         .map(|((g, r), x)| judge_group(g, r, size(&x.array), scale, gate))
         .collect();
+    if let (Some(g), Some(r)) = (&computed.absgrad, &fixture.absgrad) {
+        let [g, r] = [g, r].map(|array| Group {
+            name: "absgrad",
+            // Ours has the cameras in front; the fixture may have none.
+            array: Array {
+                shape: r.shape.clone(),
+                values: array.values.clone(),
+            },
+            offset: vec![0; r.shape.len()],
+        });
+        // Of a screen mean, in pixels.
+        let size = fixture.scene.size;
+        let size = f64::from(size.width.max(size.height));
+        groups.push(judge_group(&g, &r, size, scale, gate));
+    }
 
     let (g, r) = (&computed.outputs, &fixture.expected);
     let mut outputs = vec![

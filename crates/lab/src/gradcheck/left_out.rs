@@ -32,7 +32,12 @@ pub(super) fn check(
     let mut rest = fixture.clone();
     clear(&mut rest.scene.upstream, &near);
     clear(&mut rest.expected, &near);
-    rest.gradients = double(&rest.scene)?.gradients;
+    let reference_of_rest = double(&rest.scene)?;
+    rest.gradients = reference_of_rest.gradients;
+    // In the shape of the file, which may have no camera in front.
+    if let (Some(expected), Some(ours)) = (&mut rest.absgrad, reference_of_rest.absgrad) {
+        expected.values = ours.values;
+    }
     let mut computed = run(&rest.scene, device, Precision::F32, bug)?;
     clear(&mut computed.outputs, &near);
     let mut report = compare(&rest, &computed, Precision::F32, near.len());

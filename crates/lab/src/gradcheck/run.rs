@@ -39,6 +39,8 @@ pub struct Computed {
     pub outputs: Outputs,
     /// Gradients of the scene's loss, in the shapes of its inputs.
     pub gradients: Inputs,
+    /// Absolute gradients of the screen means `[C, N, 2]`, if the scene requests them.
+    pub absgrad: Option<Array>,
     /// Screen splats `[C, N, 9]`, in the layout of [`Projected::packed`].
     pub projected: Array,
     /// Opacities passed to the rasteriser `[C, N]`: compensated in anti-aliased mode.
@@ -72,6 +74,13 @@ pub fn run(
         source,
     };
     let projected = leaves.project(scene, bug).map_err(op)?;
+    let (projected, absgrad) = match scene.absgrad {
+        true => {
+            let (probed, leaf) = projected.with_absgrad();
+            (probed, Some(leaf))
+        }
+        false => (projected, None),
+    };
     let (rendered, blended) = leaves.render(scene, &projected, bug).map_err(op)?;
     let image = rendered.image().narrow(3, 0, 3);
     let depth = (scene.upstream.depth.as_ref())
@@ -90,6 +99,9 @@ pub fn run(
                 .transpose()?,
         },
         gradients: leaves.gradients(scene, &grads, &download)?,
+        absgrad: absgrad
+            .map(|leaf| download.gradient(leaf.grad(&grads), &Array::zeros(&[c, n, 2])))
+            .transpose()?,
         projected: download.tensor(projected.packed(), &[c, n, 9])?,
         opacities: download.tensor(blended, &[c, n])?,
     })

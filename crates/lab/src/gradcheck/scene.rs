@@ -86,6 +86,8 @@ pub struct Scene {
     pub inputs: Inputs,
     /// Gradients of the loss with respect to the images.
     pub upstream: Outputs,
+    /// Whether the absolute gradients of the screen means are wanted too.
+    pub absgrad: bool,
 }
 
 /// Position in every dimension of a flat index into a row-major array.

@@ -26,6 +26,7 @@ fn any_number_of_coefficients_is_checked() {
             scene,
             expected: reference.outputs,
             gradients: reference.gradients,
+            absgrad: reference.absgrad,
         };
         for precision in [Precision::F64, Precision::F32] {
             let report = check(&fixture, &Device::flex(), precision, None).unwrap();

@@ -1,5 +1,7 @@
-//! `rasterize`: saves its inputs and the backend's lists of splats per tile. With a background it
-//! has four parents, without one three.
+//! `rasterize`: saves its inputs and the backend's lists of splats per tile.
+//!
+//! An op has one output, so the absolute gradients of the screen means, a second result of the
+//! backward pass, come out as the gradient of a parent that the image does not depend on.
 
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};
@@ -46,56 +48,34 @@ impl<B: RasterizeBackend> Rasterize<B> {
     }
 }
 
-impl<B: RasterizeBackend> Saved<B, 3> for Rasterize<B> {
-    fn gradients(
-        self,
-        grad: FloatTensor<B>,
-        [packed, colors, opacities]: [bool; 3],
-    ) -> [Option<FloatTensor<B>>; 3] {
-        let needs_grad = RasterizeTensors {
-            packed,
-            colors,
-            opacities,
-            background: false,
-        };
-        let grads = self.backward(grad, needs_grad);
-        [grads.packed, grads.colors, grads.opacities]
-    }
-}
-
-impl<B: RasterizeBackend> Saved<B, 4> for Rasterize<B> {
-    fn gradients(self, grad: FloatTensor<B>, needs_grad: [bool; 4]) -> [Option<FloatTensor<B>>; 4] {
+impl<B: RasterizeBackend> Saved<B, 5> for Rasterize<B> {
+    fn gradients(self, grad: FloatTensor<B>, needs_grad: [bool; 5]) -> [Option<FloatTensor<B>>; 5] {
         self.backward(grad, needs_grad.into()).into()
     }
 }
 
 impl<B: RasterizeBackend, C: CheckpointStrategy> RasterizeOps for Autodiff<B, C> {
     fn rasterize(
-        OpInputs(inputs): RasterizeInputs<Self>,
+        OpInputs(mut inputs): RasterizeInputs<Self>,
         args: RasterizeArgs,
     ) -> FloatTensor<Self> {
-        let [packed, colors, opacities] =
-            [&inputs.packed, &inputs.colors, &inputs.opacities].map(|input| input.node());
-        let background = inputs.background.as_ref().map(|input| input.node());
+        // Absolute gradients that nobody will read are not asked for.
+        inputs.absgrad = inputs.absgrad.filter(|leaf| leaf.is_tracked());
+        // A parent that is absent is one that is not tracked.
+        let untracked = || FloatTensor::<Self>::new(inputs.packed.primitive().clone()).node();
+        let nodes = inputs.inputs().map(|input| match input {
+            Some(input) => input.node(),
+            None => untracked(),
+        });
         let inputs = (
             OpInputs(inputs.map_inputs(|input| input.into_primitive())),
             args,
         );
-        let tracked = |(inputs, args)| Rasterize::new(inputs, args);
-        let plain = |(inputs, args)| B::rasterize(inputs, args);
-        match background {
-            Some(background) => record::<B, C, Rasterize<B>, _, 4>(
-                [packed, colors, opacities, background],
-                inputs,
-                tracked,
-                plain,
-            ),
-            None => record::<B, C, Rasterize<B>, _, 3>(
-                [packed, colors, opacities],
-                inputs,
-                tracked,
-                plain,
-            ),
-        }
+        record::<B, C, Rasterize<B>, _, 5>(
+            nodes.into(),
+            inputs,
+            |(inputs, args)| Rasterize::new(inputs, args),
+            |(inputs, args)| B::rasterize(inputs, args),
+        )
     }
 }

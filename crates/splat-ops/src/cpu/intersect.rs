@@ -351,6 +351,7 @@ mod tests {
             colors: tensor(vec![1.0f32], [1, 1, 1]),
             opacities: tensor(vec![0.5f32], [1, 1]),
             background: Some(tensor(vec![1.0f32], [1, 1])),
+            absgrad: Some(tensor(vec![0.0f32; 2], [1, 1, 2])),
         });
         LIMIT.set(0);
         let (image, state) = Flex::rasterize_tracked(inputs.clone(), &args);
@@ -359,9 +360,9 @@ mod tests {
         assert_eq!(image.as_slice::<f32>(), Some(&[0.0; 12][..]));
 
         let grad = tensor(vec![1.0f32; 12], [1, 2, 3, 2]);
-        let grads = Flex::rasterize_backward(inputs, state, grad, &args, [true; 4].into());
-        let grads: [_; 4] = grads.into();
-        for (grad, length) in grads.iter().zip([PROJECTED_WIDTH, 1, 1, 1]) {
+        let grads = Flex::rasterize_backward(inputs, state, grad, &args, [true; 5].into());
+        let grads: [_; 5] = grads.into();
+        for (grad, length) in grads.iter().zip([PROJECTED_WIDTH, 1, 1, 1, 2]) {
             let grad = grad.as_ref().and_then(|grad| grad.as_slice::<f32>());
             assert_eq!(grad, Some(&vec![0.0; length][..]));
         }

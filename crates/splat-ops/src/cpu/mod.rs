@@ -22,6 +22,7 @@ mod instructions;
 mod intersect;
 mod math;
 mod overwritten;
+mod perturb;
 mod photometric;
 #[cfg(test)]
 pub(crate) mod poison;

@@ -45,7 +45,7 @@ use crate::backend::{
 use crate::settings::RasterizeArgs;
 use inputs::Camera;
 use rows::{GradientRows, RowOfTilesBackward, blend};
-use splat::MOMENTS;
+use splat::ABSOLUTE;
 pub use view::State;
 use view::{Listed, View};
 pub use work::{RasterizeWork, rasterize_work};
@@ -134,6 +134,10 @@ fn backward<T: Real>(
     let mut packed = Uncleared::new(c * n * PROJECTED_WIDTH);
     let mut colors = Uncleared::new(c * n * d);
     let mut opacities = Uncleared::new(c * n);
+    let absolute = buffers.absgrad.is_some();
+    let mut absgrad = Uncleared::new(if absolute { c * n * ABSOLUTE } else { 0 });
+    let absgrads = absgrad.chunks_of_each(c, CHUNK * ABSOLUTE);
+    let mut absgrads = absgrads.into_iter().map(|(.., part)| part);
     let mut rows = packed
         .chunks_of_each(c, CHUNK * PROJECTED_WIDTH)
         .into_iter()
@@ -145,6 +149,7 @@ fn backward<T: Real>(
                 packed,
                 colors,
                 opacities,
+                absgrad: absgrads.next(),
             },
         );
     for (index, frame) in state.frames::<T>().iter().enumerate() {
@@ -152,7 +157,7 @@ fn backward<T: Real>(
         let view = View::new(&frame.listed, background, args);
         let grad = &grad[index * pixels..(index + 1) * pixels];
         // Every intersection writes its own row; each splat then sums its rows in order.
-        let width = MOMENTS + d;
+        let width = frame.listed.partials();
         let mut partials = Uncleared::<T>::new(view.lists.intersections() * width);
         let of_row = |ty: usize| view.intersections_of_row(ty) * width;
         let backgrounds = heaviest_first(
@@ -192,5 +197,7 @@ fn backward<T: Real>(
             .opacities
             .then(|| tensor(opacities.written(), [c, n])),
         background: needs_grad.background.then(|| tensor(of_background, [c, d])),
+        absgrad: (needs_grad.absgrad && absolute)
+            .then(|| tensor(absgrad.written(), [c, n, ABSOLUTE])),
     }
 }

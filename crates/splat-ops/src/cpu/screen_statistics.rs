@@ -16,7 +16,7 @@ use crate::backend::{
 /// Gaussians per unit of parallel work, at least.
 const CHUNK: usize = 4096;
 
-/// `[C, N, 9]`, read where it lies.
+/// `[C, N, 9]` or `[C, N, 2]`, read where it lies.
 struct Rows<'a, T> {
     values: &'a [T],
     start: usize,

@@ -6,6 +6,7 @@
 mod activation;
 mod adam;
 mod blur;
+mod perturb;
 mod photometric;
 mod project;
 mod rasterize;

@@ -1,7 +1,9 @@
 //! Promises of every backend, tested on the native path and on the kernels if there is an adapter.
 
+mod absgrad;
 mod activation;
 mod decisions;
+mod perturb;
 mod photometric;
 mod poison;
 mod probe;

@@ -36,9 +36,10 @@ impl Pixels {
         channels: u32,
         first_channel: u32,
         #[comptime] plan: Plan,
-        #[comptime] width: usize,
+        #[comptime] layout: SlotLayout,
         #[comptime] first_launch: bool,
     ) -> Pixels {
+        let width = comptime!(layout.width);
         let pixels = comptime!(plan.pixels());
         let mut t = Array::<f32>::new(pixels);
         let mut behind = Array::<f32>::new(pixels);
@@ -71,6 +72,16 @@ impl Pixels {
                         seen += value * background[at];
                     }
                 }
+                if comptime!(layout.reads_all_channels()) {
+                    #[comptime]
+                    if let ComptimeOption::Some(background) = background {
+                        // The first one is there already.
+                        for channel in 1..channels as usize {
+                            let at = place.camera as usize * channels as usize + channel;
+                            seen += grad_output[from + channel] * background[at];
+                        }
+                    }
+                }
                 if comptime!(first_launch) {
                     seen -= grad_output[from + channels as usize];
                 }
@@ -83,12 +94,18 @@ impl Pixels {
     }
 
     /// Sums over the pixels of the gradients of the splat that begins at `at`, whose place in the
-    /// list is `entry`; the pixels then stand before it.
+    /// list is `entry`; the pixels then stand before it. Where the layout
+    /// reads all channels, it takes them from `colors` and `grad_output`.
     pub fn gradients(
         &mut self,
         splats: &Shared<[f32]>,
         at: usize,
         entry: u32,
+        colors: &[f32],
+        grad_output: &[f32],
+        splat: usize,
+        channels: usize,
+        grid: Grid,
         place: Place,
         thresholds: Thresholds,
         #[comptime] plan: Plan,
@@ -112,6 +129,8 @@ impl Pixels {
         let mut sum_z1_dx = 0.0f32;
         let mut sum_z2_dx = 0.0f32;
         let mut sum_z2_dy = 0.0f32;
+        let mut absolute_x = 0.0f32;
+        let mut absolute_y = 0.0f32;
         #[unroll]
         for q in 0..comptime!(plan.pixels()) {
             let (x, y) = place.pixel(q, plan);
@@ -123,21 +142,33 @@ impl Pixels {
             let before = self.t[q] / clear;
             let weight = alpha * before;
             let mut dot = 0.0f32;
-            #[unroll]
-            for channel in 0..width {
-                let value = self.g[q * width + channel];
-                dot += color[channel] * value;
-                if comptime!(layout.colors) {
-                    color_sums[channel] += weight * value;
+            if comptime!(layout.reads_all_channels()) {
+                let (_, pixel) = pixel_index(grid, place, x, y);
+                for channel in 0..channels {
+                    let value = grad_output[pixel * (channels + 1) + channel];
+                    dot += colors[splat * channels + channel] * value;
+                }
+            } else {
+                #[unroll]
+                for channel in 0..width {
+                    let value = self.g[q * width + channel];
+                    dot += color[channel] * value;
+                    if comptime!(layout.colors) {
+                        color_sums[channel] += weight * value;
+                    }
                 }
             }
-            if comptime!(layout.shape) {
+            if comptime!(layout.shape || layout.absolute) {
                 let g_alpha = before * dot - self.behind[q] / clear;
                 let g_sigma = select(thresholds.capped(raw), 0.0f32, -g_alpha * raw);
                 let g_sigma = select(seen, g_sigma, 0.0f32);
                 // Far from the splat a broken one may overflow.
                 let g_z1 = g_sigma * select(seen, s.z1, 0.0f32);
                 let g_z2 = g_sigma * select(seen, s.z2, 0.0f32);
+                if comptime!(layout.absolute) {
+                    absolute_x += f32::abs(shape.w11 * g_z1 + shape.w21 * g_z2);
+                    absolute_y += f32::abs(shape.w22 * g_z2);
+                }
                 sum += g_sigma;
                 sum_z1 += g_z1;
                 sum_z2 += g_z2;
@@ -158,6 +189,10 @@ impl Pixels {
             parts[3] = sum_z2_dx;
             parts[4] = sum_z2_dy;
             parts[5] = -sum / shape.opacity;
+        }
+        if comptime!(layout.absolute) {
+            parts[comptime!(layout.first_absolute())] = absolute_x;
+            parts[comptime!(layout.first_absolute() + 1)] = absolute_y;
         }
         if comptime!(layout.colors) {
             #[unroll]

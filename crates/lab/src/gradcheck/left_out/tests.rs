@@ -52,6 +52,7 @@ fn judged_whole(scene: Scene) -> (Fixture, bool) {
         hard: false,
         expected: reference.outputs,
         gradients: reference.gradients,
+        absgrad: reference.absgrad,
         scene,
     };
     let single = run(&fixture.scene, &Device::flex(), Precision::F32, None).unwrap();

@@ -19,6 +19,9 @@
 //! d w11 = sum(g z1^2) / w11           d w22  = (sum(g z2^2) - w21 / w11 sum(g z1 z2)) / w22
 //! d w21 = sum(g z1 z2) / w11
 //! ```
+//!
+//! The absolute gradients of the mean (Ye et al. 2024, *AbsGS*) are two sums more, where they are
+//! asked for: of `|g (w11 z1 + w21 z2)|` and of `|g z2|`.
 
 use core::ops::Range;
 
@@ -30,14 +33,15 @@ use super::super::tiles::TILE;
 use super::batch::{Batch, ByPlace, by_groups};
 use super::pixels::{Columns, Pixels, four_totals, load_each, total};
 use super::splat::{
-    ACROSS, Aligned, BATCH, BLOCKS, Centres, GROUP, LANES, Lanes, MOMENTS, SIDE, Thresholds,
-    corner, in_blocks, row_mut, row_of, square,
+    ABSOLUTE, ACROSS, Aligned, BATCH, BLOCKS, Centres, GROUP, LANES, Lanes, MOMENTS, SIDE, Splat,
+    Thresholds, corner, in_blocks, row_mut, row_of, shape_sums, square,
 };
 use super::trace::{ByBlock, TileTrace};
 use super::view::View;
 
-/// The pixels of a tile while they are walked back to front, by block.
-pub(super) struct GradientTile<S: Simd, T: Real> {
+/// The pixels of a tile while they are walked back to front, by block. `ABS`: absolute gradients
+/// are asked for.
+pub(super) struct GradientTile<S: Simd, T: Real, const ABS: bool> {
     /// B, behind the splats that are still to come.
     behind: ByBlock<T>,
     /// D of each block: gradient of the image.
@@ -47,15 +51,15 @@ pub(super) struct GradientTile<S: Simd, T: Real> {
     pairs: Vec<Aligned<Pairs<T>>>,
     /// c . grad of the same, of channels beyond the first group.
     toward: Vec<Aligned<Lanes<T>>>,
-    /// Sums of each splat of the batch, whose lanes are added last: the moments and the first group
-    /// of channels.
+    /// Sums of each splat of the batch, whose lanes are added last: those of its shape and the
+    /// first group of channels.
     sums: Box<ByPlace<Sums<S, T>>>,
     /// Likewise of the further channels.
     further_sums: Vec<Vector<S, T>>,
 }
 
 /// By fours, to which they are added up.
-type Sums<S, T> = Aligned<[Vector<S, T>; (MOMENTS + GROUP).next_multiple_of(4)]>;
+type Sums<S, T> = Aligned<[Vector<S, T>; (shape_sums(true) + GROUP).next_multiple_of(4)]>;
 
 /// A splat and each pixel of a block.
 #[derive(Clone, Copy)]
@@ -69,7 +73,10 @@ struct Pairs<T> {
     weight: Lanes<T>,
 }
 
-impl<S: Simd, T: Real> GradientTile<S, T> {
+impl<S: Simd, T: Real, const ABS: bool> GradientTile<S, T, ABS> {
+    /// Sums per splat before those of its colours.
+    const SHAPE_SUMS: usize = shape_sums(ABS);
+
     pub(super) fn new(channels: usize) -> Self {
         let none = [T::ZERO; LANES];
         let pairs = Pairs {
@@ -178,8 +185,8 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
         }
     }
 
-    /// Walks the list back to front and writes the sums of each splat over the tile, `MOMENTS + D`
-    /// values. The splats reach the blocks that the forward pass found.
+    /// Walks the list back to front and writes the sums of each splat over the tile,
+    /// `shape_sums(ABS) + D` values. The splats reach the blocks that the forward pass found.
     #[inline(always)]
     pub(super) fn walk(
         &mut self,
@@ -193,7 +200,7 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
         let thresholds = Thresholds::<T>::new(view.args);
         let corner = corner([tx, ty]);
         let batches = list.chunks(BATCH).zip(trace.reached.chunks(BATCH));
-        let batches = batches.zip(partials.chunks_mut(BATCH * (MOMENTS + channels)));
+        let batches = batches.zip(partials.chunks_mut(BATCH * (Self::SHAPE_SUMS + channels)));
         let next = [beside.chunks(BATCH).next_back().unwrap_or_default()].into_iter();
         let next = next.chain(list.chunks(BATCH)).rev().skip(1);
         for ((number, ((part, reached), partials)), next) in batches.enumerate().rev().zip(next) {
@@ -240,9 +247,9 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
 
     #[inline(always)]
     fn write_sums(&self, channels: usize, partials: &mut [T]) {
-        let together = MOMENTS + channels.min(GROUP);
+        let together = Self::SHAPE_SUMS + channels.min(GROUP);
         let further = channels.saturating_sub(GROUP);
-        let partials = partials.chunks_exact_mut(MOMENTS + channels);
+        let partials = partials.chunks_exact_mut(Self::SHAPE_SUMS + channels);
         for (place, (partials, Aligned(sums))) in partials.zip(&*self.sums).enumerate() {
             let (first, rest) = partials.split_at_mut(together);
             let mut totals = [[T::ZERO; 4]; 3];
@@ -385,8 +392,12 @@ impl<S: Simd, T: Real> GradientTile<S, T> {
             behind = share.times_from(difference, behind);
 
             let Aligned(sums) = &mut self.sums[usize::from(*place)];
-            let (moments, of_colors) = sums.split_at_mut(MOMENTS);
+            let (shape, of_colors) = sums.split_at_mut(Self::SHAPE_SUMS);
+            let (moments, absolute) = shape.split_at_mut(MOMENTS);
             add_moments(g, pairs, moments);
+            if ABS {
+                add_absolute(g, pairs, &self.batch.splat(*place), absolute);
+            }
             for (sum, grad) in of_colors.iter_mut().zip(grads) {
                 weight.times_add_to(grad, sum);
             }
@@ -443,6 +454,23 @@ fn add_moments<S: Simd, T: Real>(g: Pixels<S, T>, pairs: &Pairs<T>, sums: &mut [
     one_by_z1.times_add_to(z1, &mut sums[3]);
     two.times_add_to(z1, &mut sums[4]);
     by_z2.times_add_to(z2, &mut sums[5]);
+}
+
+/// Adds a block's `|g (w11 z1 + w21 z2)|` and `|g z2|`.
+#[inline(always)]
+fn add_absolute<S: Simd, T: Real>(
+    g: Pixels<S, T>,
+    pairs: &Pairs<T>,
+    splat: &Splat<T>,
+    sums: &mut [Vector<S, T>],
+) {
+    let (z1, z2) = (Columns::load(&pairs.z1), Pixels::load(&pairs.z2));
+    let across = z1.times(Columns::splat(splat.w11)).pixels();
+    let across = z2.times_plus(Pixels::splat(splat.w21), across);
+    let values: [_; ABSOLUTE] = [g.times(across), g.times(z2)];
+    for (value, sum) in values.into_iter().zip(sums) {
+        value.magnitudes().column_sums().add_to(sum);
+    }
 }
 
 #[cfg(test)]

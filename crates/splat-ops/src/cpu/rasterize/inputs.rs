@@ -11,6 +11,8 @@ pub(super) struct Camera<'a, T> {
     pub(super) opacities: &'a [T],
     pub(super) background: Option<&'a [T]>,
     pub(super) channels: usize,
+    /// Whether absolute gradients may be asked for.
+    pub(super) absolute: bool,
 }
 
 /// The tensors of one call.
@@ -28,6 +30,7 @@ impl<'a, T: Real> Camera<'a, T> {
             opacities: part(&buffers.opacities, index, n),
             background: buffers.background.as_ref().map(|b| part(b, index, d)),
             channels: d,
+            absolute: buffers.absgrad.is_some(),
         }
     }
 }

@@ -142,6 +142,12 @@ impl<S: Simd, T: Real> Pixels<S, T> {
         each_register!(i => kept(values.0[i].lt(bound.0[i]), self.0[i]))
     }
 
+    /// Absolute values.
+    #[inline(always)]
+    pub(super) fn magnitudes(self) -> Self {
+        each_register!(i => self.0[i].max(T::ZERO.splat() - self.0[i]))
+    }
+
     /// Whether any pixel is below.
     #[inline(always)]
     pub(super) fn any_below(self, bound: T) -> bool {

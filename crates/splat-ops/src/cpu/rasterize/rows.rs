@@ -11,7 +11,7 @@ use super::super::uninit::Part;
 use super::batch::by_groups;
 use super::blend::BlendTile;
 use super::gradient::GradientTile;
-use super::splat::{GROUP, MOMENTS};
+use super::splat::{ABSOLUTE, GROUP, MOMENTS, shape_sums};
 use super::trace::Trace;
 use super::view::{Frame, Listed, View};
 use crate::backend::PROJECTED_WIDTH;
@@ -106,14 +106,23 @@ impl<T: Real> RowOfTilesBackward<'_, T> {
 
     #[inline(always)]
     fn walk<S: Simd>(self) -> Vec<T> {
+        match self.view.absolute {
+            true => self.walk_tiles::<S, true>(),
+            false => self.walk_tiles::<S, false>(),
+        }
+    }
+
+    /// `ABS`: with absolute gradients.
+    #[inline(always)]
+    fn walk_tiles<S: Simd, const ABS: bool>(self) -> Vec<T> {
         let Self { view, ty, .. } = self;
         let channels = view.channels;
         let mut background = vec![T::ZERO; channels];
-        let mut tile = GradientTile::<S, T>::new(channels);
+        let mut tile = GradientTile::<S, T, ABS>::new(channels);
         let (mut partials, mut first) = (self.partials, 0);
         for tx in 0..view.grid.columns {
             let count = view.list([tx, ty]).len();
-            let (sums, later) = partials.split_at_mut(count * (MOMENTS + channels));
+            let (sums, later) = partials.split_at_mut(count * (shape_sums(ABS) + channels));
             let of_tile = self.trace.tile(tx, first..first + count);
             (partials, first) = (later, first + count);
             tile.load(view, self.grad, [tx, ty], &of_tile, &mut background);
@@ -144,6 +153,8 @@ pub(super) struct GradientRows<'a, T> {
     pub(super) packed: Part<'a, T>,
     pub(super) colors: Part<'a, T>,
     pub(super) opacities: Part<'a, T>,
+    /// Absolute gradients of the screen means, where they are asked for.
+    pub(super) absgrad: Option<Part<'a, T>>,
 }
 
 impl<T: Real> GradientRows<'_, T> {
@@ -152,6 +163,7 @@ impl<T: Real> GradientRows<'_, T> {
         let d = frame.channels;
         let [packed, colors, opacities] =
             [self.packed, self.colors, self.opacities].map(Part::cleared);
+        let mut absgrad = self.absgrad.map(Part::cleared);
         let listed = &frame.lists.listed;
         let at = |n: usize| listed.partition_point(|listed| (*listed as usize) < n);
         for splat in at(self.first)..at(self.first + opacities.len()) {
@@ -162,15 +174,21 @@ impl<T: Real> GradientRows<'_, T> {
             packed[..2].copy_from_slice(&geometry[..2]);
             packed[3..6].copy_from_slice(&geometry[2..]);
             opacities[row] = of_opacity;
+            if let Some(absgrad) = &mut absgrad {
+                let sums: [_; ABSOLUTE] = frame.sum(splat, partials, MOMENTS);
+                let of_mean = frame.splats[splat].absolute_gradients(sums);
+                absgrad[row * ABSOLUTE..][..ABSOLUTE].copy_from_slice(&of_mean);
+            }
             let colors = &mut colors[row * d..][..d];
             by_groups!(frame.sum_colors(0..d, splat, partials, colors));
         }
     }
 
     pub(super) fn clear(self) {
-        for part in [self.packed, self.colors, self.opacities] {
+        let parts = [self.packed, self.colors, self.opacities].into_iter();
+        parts.chain(self.absgrad).for_each(|part| {
             part.cleared();
-        }
+        });
     }
 }
 
@@ -185,6 +203,8 @@ mod tests {
     use crate::{ErrorSlot, ImageSize};
 
     const CHANNELS: usize = 5;
+    const ABSOLUTE_TOO: bool = true;
+    const PARTIALS: usize = shape_sums(ABSOLUTE_TOO) + CHANNELS;
 
     /// Image, what partial gradients each listed splat has in its tiles, and the background's
     /// gradient.
@@ -202,14 +222,14 @@ mod tests {
         fn with_simd<S: Simd>(self) -> Self::Output {
             let Self { view, grad, .. } = self;
             let mut image = vec![T::ZERO; grad.len()];
-            let mut partials = vec![T::ZERO; view.lists.intersections() * (MOMENTS + CHANNELS)];
+            let mut partials = vec![T::ZERO; view.lists.intersections() * PARTIALS];
             let mut background = vec![];
             let slab = TILE * view.width * (CHANNELS + 1);
             let mut later = &mut *partials;
             for (ty, image) in image.chunks_mut(slab).enumerate() {
                 let trace = RowOfTiles { view, ty, image }.with_simd::<S>();
                 let length = view.intersections_of_row(ty);
-                let (own, rest) = later.split_at_mut(length * (MOMENTS + CHANNELS));
+                let (own, rest) = later.split_at_mut(length * PARTIALS);
                 later = rest;
                 let row = RowOfTilesBackward {
                     view,
@@ -266,6 +286,7 @@ mod tests {
             opacities: &opacities,
             background: Some(&background),
             channels: CHANNELS,
+            absolute: ABSOLUTE_TOO,
         };
         let listed = Listed::new(&camera, &args).unwrap();
         let view = View::new(&listed, camera.background, &args);

@@ -14,8 +14,17 @@ use crate::settings::RasterizeArgs;
 /// bits.
 pub(super) const BATCH: usize = 128;
 
-/// Sums per splat before those of its D colours.
+/// Sums per splat that its shape and opacity need.
 pub(super) const MOMENTS: usize = 6;
+
+/// Sums of the absolute gradients of a splat's screen mean, where they are asked for.
+pub(super) const ABSOLUTE: usize = 2;
+
+/// Sums per splat before those of its D colours: the moments, and then the absolute gradients if
+/// they are asked for.
+pub(super) const fn shape_sums(absolute: bool) -> usize {
+    MOMENTS + if absolute { ABSOLUTE } else { 0 }
+}
 
 /// Blocks in each row and each column of a tile.
 pub(super) const ACROSS: usize = TILE / SIDE;
@@ -85,6 +94,16 @@ impl<T: Real> Splat<T> {
             (z22 - w21 * of_w11 * z12) * of_w22 * unit,
         ];
         (geometry, -one / self.opacity)
+    }
+}
+
+impl<T: Real> Splat<T> {
+    /// Absolute gradients of the screen mean, from the sums of `|g (w11 z1 + w21 z2)|` and
+    /// `|g z2|`.
+    #[inline(always)]
+    pub(super) fn absolute_gradients(&self, [x, y]: [T; ABSOLUTE]) -> [T; ABSOLUTE] {
+        let square = T::of(1.0 / (UNIT * UNIT));
+        [x * square, self.w22.abs() * y * square]
     }
 }
 

@@ -12,7 +12,7 @@ use super::super::simd::prefetch;
 use super::super::tiles::{CHUNK, Grid, TILE};
 use super::super::uninit::Uncleared;
 use super::inputs::Camera;
-use super::splat::{GROUP, MOMENTS, Splat};
+use super::splat::{GROUP, Splat, shape_sums};
 use super::trace::{Trace, kept_per_intersection};
 use crate::OpError;
 use crate::settings::RasterizeArgs;
@@ -44,15 +44,17 @@ pub(super) struct Listed<T> {
     /// Channels of each splat's colour that it does not have with it.
     pub(super) further_colors: Vec<T>,
     pub(super) channels: usize,
+    /// Whether absolute gradients may be asked for.
+    pub(super) absolute: bool,
 }
 
 impl<T: Real> Listed<T> {
     /// Bytes kept of each intersection by the forward pass, and, where a backward pass follows, by
     /// its partial gradients.
-    fn kept_per_intersection(channels: usize, args: &RasterizeArgs) -> usize {
+    fn kept_per_intersection(camera: &Camera<T>, args: &RasterizeArgs) -> usize {
         let number = size_of::<T>();
         let partials = if args.backward {
-            (MOMENTS + channels) * number
+            (shape_sums(camera.absolute) + camera.channels) * number
         } else {
             0
         };
@@ -63,7 +65,8 @@ impl<T: Real> Listed<T> {
         let _span = trace_span!("rasterize lists").entered();
         let inputs = [camera.packed, camera.colors, camera.opacities];
         let d = camera.channels;
-        let (lists, splats) = TileLists::new(inputs, args, Self::kept_per_intersection(d, args))?;
+        let kept = Self::kept_per_intersection(camera, args);
+        let (lists, splats) = TileLists::new(inputs, args, kept)?;
         let further = d.saturating_sub(GROUP);
         let mut further_colors = Uncleared::<T>::new(lists.listed.len() * further);
         further_colors
@@ -81,7 +84,13 @@ impl<T: Real> Listed<T> {
             splats,
             further_colors: further_colors.written(),
             channels: d,
+            absolute: camera.absolute,
         })
+    }
+
+    /// Partial gradients of each intersection: those of the shape, then those of the colours.
+    pub(super) fn partials(&self) -> usize {
+        shape_sums(self.absolute) + self.channels
     }
 
     /// Sums some of a splat's partial gradients over its tiles, in the order in which these were
@@ -93,7 +102,7 @@ impl<T: Real> Listed<T> {
         partials: &[T],
         first: usize,
     ) -> [T; COUNT] {
-        let width = MOMENTS + self.channels;
+        let width = self.partials();
         let mut sums = [T::ZERO; COUNT];
         for i in self.lists.emitted(splat) {
             if first == 0 {
@@ -120,7 +129,7 @@ impl<T: Real> Listed<T> {
         partials: &[T],
         sums: &mut [T],
     ) {
-        let of_channels = self.sum::<COUNT>(splat, partials, MOMENTS + first);
+        let of_channels = self.sum::<COUNT>(splat, partials, shape_sums(self.absolute) + first);
         sums[first..first + COUNT].copy_from_slice(&of_channels);
     }
 }
@@ -139,6 +148,8 @@ pub(super) struct View<'a, T> {
     pub(super) further_colors: &'a [T],
     pub(super) background: Option<&'a [T]>,
     pub(super) channels: usize,
+    /// Whether absolute gradients are asked for.
+    pub(super) absolute: bool,
     pub(super) width: usize,
     pub(super) height: usize,
     pub(super) grid: Grid,
@@ -157,6 +168,7 @@ impl<'a, T: Real> View<'a, T> {
             further_colors: &listed.further_colors,
             background,
             channels: listed.channels,
+            absolute: listed.absolute,
             width: args.size.width as usize,
             height: args.size.height as usize,
             grid: Grid::new(args),

@@ -67,6 +67,7 @@ pub fn rasterize_work<const DC: usize, const DO: usize>(
             opacities: &opacities[index * n..(index + 1) * n],
             background: None,
             channels: d,
+            absolute: false,
         };
         work.add(&of_camera(&camera, &args)?);
     }
