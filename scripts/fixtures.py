@@ -30,12 +30,13 @@ import numpy as np
 import torch
 
 
-def write_fixture(path, function, inputs, upstream=None, constants=(), case="", seed=0):
+def write_fixture(path, function, inputs, upstream=None, constants=(), case="", seed=0, metadata=None):
     """Evaluate `function(**inputs)`, differentiate `sum(upstream * outputs)`, and write all of it to `path`.
 
     inputs     dictionary of tensors, arrays or numbers
     upstream   dictionary of output name -> gradient of the loss to it; random from 0.5 to 1 of either sign by default
     constants  names of inputs that are not differentiated
+    metadata   dictionary of further entries, strings
     Returns the gradients by input.
     """
     unknown = set(constants) - set(inputs)
@@ -70,7 +71,7 @@ def write_fixture(path, function, inputs, upstream=None, constants=(), case="", 
         if name in arrays:
             raise ValueError(f"two tensors are named `{name}`")
         arrays[name] = array
-    Path(path).write_bytes(serialise(arrays, {"outputs": ",".join(outputs), "case": case}))
+    Path(path).write_bytes(serialise(arrays, {**(metadata or {}), "outputs": ",".join(outputs), "case": case}))
     return gradients
 
 

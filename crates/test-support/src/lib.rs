@@ -1,5 +1,9 @@
 //! Helpers shared by the tests of all crates.
 
+mod fixture;
+
+pub use fixture::{Reference, relative_error};
+
 use std::fmt::Display;
 
 /// The adapter opened by a test of the CubeCL kernels, a software one included. Without an adapter
