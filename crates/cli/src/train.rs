@@ -17,7 +17,7 @@ use crate::report::progress::Progress;
 use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
 use resume::Interrupted;
 use splat_data::{Capture, CaptureSettings};
-use splat_trainer::{Checkpoint, TrainSettings, Trainer, TrainerBuilder};
+use splat_trainer::{Checkpoint, StrategyKind, TrainSettings, Trainer, TrainerBuilder};
 
 /// The held-out views are measured this many times during a run, for the curves.
 const MEASUREMENTS: usize = 10;
@@ -55,9 +55,9 @@ pub struct TrainArgs {
     /// Highest degree of spherical harmonics, 0 to 3 [default: 3]
     #[arg(long, value_name = "D")]
     pub sh_degree: Option<usize>,
-    /// Density control
-    #[arg(long, value_enum, default_value_t)]
-    pub strategy: Strategy,
+    /// Which Gaussians there are [default: adc]
+    #[arg(long, value_enum)]
+    pub strategy: Option<Strategy>,
     /// No growth beyond this many Gaussians [default: seven for every ten pixels of a photo, or one
     /// for every hundred of all photos, whichever is more]
     #[arg(long, value_name = "N")]
@@ -73,12 +73,25 @@ pub struct TrainArgs {
     pub autosave: u64,
 }
 
-/// What `--strategy` takes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, ValueEnum)]
+/// Values of `--strategy`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Strategy {
     /// Adaptive density control of 3DGS: clone, split, prune, reset opacities
-    #[default]
     Adc,
+    /// The same, by absolute gradients (AbsGS): `density.absgrad` in config.toml
+    Absgrad,
+    /// Gaussians as samples (3DGS-MCMC): move dead ones, grow to a cap, add noise
+    Mcmc,
+}
+
+impl Strategy {
+    fn choose(self, config: &mut TrainSettings) {
+        config.strategy = match self {
+            Self::Adc | Self::Absgrad => StrategyKind::Adc,
+            Self::Mcmc => StrategyKind::Mcmc,
+        };
+        config.density.absgrad = self == Self::Absgrad;
+    }
 }
 
 impl TrainArgs {
@@ -94,12 +107,16 @@ impl TrainArgs {
             (None, Some(path)) => text::read_config(path)?,
             (None, None) => TrainSettings::default(),
         };
-        let Strategy::Adc = self.strategy;
+        if let Some(strategy) = self.strategy {
+            strategy.choose(&mut config);
+        }
         config.steps = self.steps.unwrap_or(config.steps);
         config.downscale = self.photos.downscale.unwrap_or(config.downscale);
         config.seed = global.seed.unwrap_or(config.seed);
         config.init.sh_degree = self.sh_degree.unwrap_or(config.init.sh_degree);
-        config.density.max_gaussians = self.max_gaussians.or(config.density.max_gaussians);
+        if let Some(most) = self.max_gaussians {
+            config.set_max_gaussians(most);
+        }
         let invalid = |problem: String| Failure::BadInput(format!("settings: {problem}"));
         config.validate().map_err(invalid)?;
         if let Some(run) = resumed {
@@ -122,7 +139,7 @@ impl TrainArgs {
         }
     }
 
-    /// What to type to go on with the run in `out`. Its settings are in the checkpoint.
+    /// The command that resumes the run in `out`. Its settings are in the checkpoint.
     fn resume_command(&self, out: &Path, global: &GlobalArgs) -> CommandLine {
         let line = CommandLine::new("train", global).path(&self.capture);
         let line = self.images(line.option("--resume", out));
@@ -161,7 +178,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     ));
     warn_of_settings(resumed.as_ref(), &config, capture.points.len(), global);
 
-    // What cannot be written down should be known before the training, not after it.
+    // Settings that cannot be written are found before the training, not after it.
     let checkpoint = resumed.map(|run| run.checkpoint);
     let changes = checkpoint.as_ref().map(|run| run.changes_with(&config));
     let changes = changes.unwrap_or_default();
@@ -263,7 +280,7 @@ fn warn_of_settings(
         ),
         None => (points, "points that training starts from"),
     };
-    if let Some(most) = config.density.max_gaussians.filter(|most| *most < count) {
+    if let Some(most) = config.max_gaussians().filter(|most| *most < count) {
         warn(format_args!(
             "--max-gaussians {most} is below the {count} {what}: all of them are kept, and none is added unless pruning \
              leaves fewer than {most}"

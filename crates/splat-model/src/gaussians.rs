@@ -236,10 +236,7 @@ mod tests {
     fn half_precision_is_for_devices_that_read_it_and_for_numbers_that_fit() {
         let mut devices = vec![Device::flex()];
         #[cfg(feature = "wgpu")]
-        match Device::wgpu_options().init() {
-            Ok(device) => devices.push(device),
-            Err(error) => eprintln!("\n*** SKIPPED: no wgpu adapter: {error} ***\n"),
-        }
+        devices.extend(crate::test_adapter::wgpu());
         let colors = |gaussians: &Gaussians, device: &Device| {
             let colors = gaussians.colors(Tensor::<2>::ones([1, 3], device), 1, None);
             host(colors.unwrap())

@@ -30,3 +30,19 @@ pub use render::{
 pub use rows::{Moments, RowEdit};
 pub use splat_data::{Camera, SceneScale, SplatData};
 pub use splat_ops as ops;
+
+/// The adapter that all tests of this crate share.
+#[cfg(all(test, feature = "wgpu"))]
+mod test_adapter {
+    use std::sync::OnceLock;
+
+    use burn::tensor::Device;
+    use splat_test_support::adapter_or_skip;
+
+    /// wgpu's. A process can open it once.
+    pub(crate) fn wgpu() -> Option<Device> {
+        static ADAPTER: OnceLock<Option<Device>> = OnceLock::new();
+        let opened = || adapter_or_skip(Device::wgpu_options().init());
+        ADAPTER.get_or_init(opened).clone()
+    }
+}

@@ -7,25 +7,25 @@ const BITS: u32 = 21;
 
 /// Storage order for Gaussians with these means: indices, sorted by code. Means that are not finite
 /// come first.
-pub(crate) fn order(means: &[[f32; 3]]) -> Vec<usize> {
+pub(crate) fn order(means: &[[f64; 3]]) -> Vec<usize> {
     let finite = || {
         means
             .iter()
             .filter(|mean| mean.iter().all(|x| x.is_finite()))
     };
-    let bound = |choose: fn(f32, f32) -> f32, start: f32| {
+    let bound = |choose: fn(f64, f64) -> f64, start: f64| {
         finite().fold([start; 3], |bound, mean| {
             [0, 1, 2].map(|axis| choose(bound[axis], mean[axis]))
         })
     };
-    let (low, high) = (bound(f32::min, f32::MAX), bound(f32::max, f32::MIN));
+    let (low, high) = (bound(f64::min, f64::MAX), bound(f64::max, f64::MIN));
     let cells = f64::from((1u32 << BITS) - 1);
-    let code = |mean: &[f32; 3]| {
+    let code = |mean: &[f64; 3]| {
         let bits = [0, 1, 2].map(|axis| {
-            let (low, high) = (f64::from(low[axis]), f64::from(high[axis]));
+            let (low, high) = (low[axis], high[axis]);
             // The cast saturates and maps NaN to zero: for a box without extent, or a mean that is
             // not finite.
-            spread(((f64::from(mean[axis]) - low) / (high - low) * cells) as u64)
+            spread(((mean[axis] - low) / (high - low) * cells) as u64)
         });
         bits[0] | bits[1] << 1 | bits[2] << 2
     };
@@ -65,8 +65,8 @@ mod tests {
     /// The cells of a cube are sorted octant by octant, and in each by x, y, z.
     #[test]
     fn octants_stay_together() {
-        let cell = |i: usize| [0, 2, 4].map(|shift| ((i * 37 % 64) >> shift & 3) as f32);
-        let means: Vec<[f32; 3]> = (0..64).map(cell).collect();
+        let cell = |i: usize| [0, 2, 4].map(|shift| ((i * 37 % 64) >> shift & 3) as f64);
+        let means: Vec<[f64; 3]> = (0..64).map(cell).collect();
         let order = order(&means);
         for (place, row) in order.iter().enumerate() {
             let octant = means[*row].map(|x| usize::from(x >= 2.0));
@@ -79,14 +79,14 @@ mod tests {
     #[test]
     fn every_row_has_a_place_whatever_its_mean() {
         let odd = [
-            f32::NAN,
-            f32::INFINITY,
-            f32::NEG_INFINITY,
-            f32::MAX,
-            f32::MIN,
+            f64::NAN,
+            f64::INFINITY,
+            f64::NEG_INFINITY,
+            f64::MAX,
+            f64::MIN,
             0.0,
         ];
-        let means: Vec<[f32; 3]> = odd.iter().map(|x| [1.0, *x, -1.0]).collect();
+        let means: Vec<[f64; 3]> = odd.iter().map(|x| [1.0, *x, -1.0]).collect();
         for means in [&means[..], &means[..1], &[]] {
             let mut order = order(means);
             order.sort_unstable();

@@ -11,6 +11,9 @@ pub enum Moments {
     Keep,
     /// Zero moments, as for a parameter that was never stepped.
     Restart,
+    /// Moments of another old row, for example for a row that keeps its moments while its values
+    /// are replaced by those of a second one.
+    Of(usize),
 }
 
 /// Rows of a row set after an edit, in terms of the old rows. All fields of the set are edited
@@ -48,7 +51,7 @@ struct NewRow {
 struct Change {
     field: String,
     kind: ChangeKind,
-    values: Vec<f32>,
+    values: Vec<f64>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -61,10 +64,10 @@ enum ChangeKind {
 #[derive(Debug, Default)]
 pub(crate) struct FieldChanges {
     /// Added to the gathered rows; zero for rows without an offset.
-    pub offsets: Option<Vec<f32>>,
+    pub offsets: Option<Vec<f64>>,
     /// Rows that are then replaced, and their new values in sequence.
     pub set_rows: Vec<usize>,
-    pub set_values: Vec<f32>,
+    pub set_values: Vec<f64>,
 }
 
 impl Default for RowEdit {
@@ -114,17 +117,17 @@ impl RowEdit {
     }
 
     /// Adds to a new row's values in a field; `values` has the width of the field.
-    pub fn offset(&mut self, row: usize, field: &str, values: &[f32]) {
+    pub fn offset(&mut self, row: usize, field: &str, values: &[f64]) {
         self.change(row, field, ChangeKind::Offset, values);
     }
 
     /// Replaces a new row's values in a field; `values` has the width of the field. Offsets of the
     /// same field then have no effect.
-    pub fn set(&mut self, row: usize, field: &str, values: &[f32]) {
+    pub fn set(&mut self, row: usize, field: &str, values: &[f64]) {
         self.change(row, field, ChangeKind::Set, values);
     }
 
-    fn change(&mut self, row: usize, field: &str, kind: ChangeKind, values: &[f32]) {
+    fn change(&mut self, row: usize, field: &str, kind: ChangeKind, values: &[f64]) {
         self.rows[row].changes.push(Change {
             field: field.to_owned(),
             kind,
@@ -152,13 +155,22 @@ impl RowEdit {
         self.rows.iter().map(|row| row.source).collect()
     }
 
+    /// Old row whose moments each new row continues, unless it restarts.
+    pub(crate) fn moment_sources(&self) -> Vec<u32> {
+        let source = |row: &NewRow| match row.moments {
+            Moments::Keep | Moments::Restart => row.source,
+            Moments::Of(other) => other as u32,
+        };
+        self.rows.iter().map(source).collect()
+    }
+
     /// Moments of each new row.
     pub fn moments(&self) -> Vec<Moments> {
         self.rows.iter().map(|row| row.moments).collect()
     }
 
     /// Offset of a new row's values in a field, if any.
-    pub fn offset_of(&self, row: usize, field: &str) -> Option<&[f32]> {
+    pub fn offset_of(&self, row: usize, field: &str) -> Option<&[f64]> {
         let changes = self.rows[row].changes.iter();
         let mut offsets =
             changes.filter(|change| change.kind == ChangeKind::Offset && change.field == field);
@@ -176,8 +188,8 @@ impl RowEdit {
 
     /// Orders the new rows so that neighbours in space are neighbours in memory, from the old
     /// means.
-    pub fn arrange(&mut self, means: &[[f32; 3]]) {
-        let means: Vec<[f32; 3]> = (0..self.len())
+    pub fn arrange(&mut self, means: &[[f64; 3]]) {
+        let means: Vec<[f64; 3]> = (0..self.len())
             .map(|row| {
                 let mean = means[self.rows[row].source as usize];
                 match self.offset_of(row, "means") {
@@ -258,6 +270,15 @@ mod tests {
         let offsets = changes["log_scales"].offsets.clone().unwrap();
         assert_eq!(offsets[..6], [0.0, 0.0, 0.0, -0.5, -0.5, -0.5]);
         assert_eq!(offsets.len(), 12);
+    }
+
+    #[test]
+    fn a_row_may_have_the_values_of_one_and_the_moments_of_another() {
+        let mut edit = RowEdit::identity(3);
+        edit.relocate(2, 0, Moments::Of(2));
+        edit.set_moments(0, Moments::Restart);
+        assert_eq!(edit.sources(), [0, 1, 0]);
+        assert_eq!(edit.moment_sources(), [0, 1, 2]);
     }
 
     #[test]

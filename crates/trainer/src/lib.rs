@@ -12,6 +12,6 @@ pub use photo::photo;
 pub use train::expected_checksum;
 pub use train::{
     Checkpoint, CheckpointError, Command, History, IntoLoss, LOSS_BATCH, LossRecord, LossTerms,
-    Progress, Snapshot, TargetView, TrainError, TrainSettings, Trained, Trainer, TrainerBuilder,
-    Warning, command_queue,
+    Progress, Snapshot, StrategyKind, TargetView, TrainError, TrainSettings, Trained, Trainer,
+    TrainerBuilder, Warning, command_queue,
 };

@@ -36,7 +36,10 @@ impl<M: Module> Optimized<M> {
         let restarts: Vec<bool> = (edit.moments().iter())
             .map(|moments| *moments == Moments::Restart)
             .collect();
-        let source = Tensor::<1, Int>::from_data(TensorData::new(sources, [n]), &device);
+        let moment_sources: Vec<i32> = (edit.moment_sources().iter())
+            .map(|row| *row as i32)
+            .collect();
+        let source = Tensor::<1, Int>::from_data(TensorData::new(sources.clone(), [n]), &device);
         let restarts = Tensor::<1, Bool>::from_data(TensorData::new(restarts, [n]), &device);
         let mut changes = edit.changes();
         let edited: Vec<String> = self
@@ -56,6 +59,10 @@ impl<M: Module> Optimized<M> {
                 None => value,
             }
         });
+        let source = match moment_sources == sources {
+            true => source,
+            false => Tensor::from_data(TensorData::new(moment_sources, [n]), &device),
+        };
         let moments = MomentEdit::Gather { source, restarts };
         for field in &edited {
             if let Some(optimizer) = self.optimizers.get_mut(field) {
@@ -87,12 +94,13 @@ impl<M: Module> Optimized<M> {
         for field in self.fields.iter().filter(in_set) {
             let [rows, _] = shapes[&field.name];
             let beyond = |source: &u32| *source as usize >= rows;
-            if let Some(index) = edit.sources().iter().position(beyond) {
-                return wrong(format!(
-                    "new row {index} is made from row {} of `{}`, which has {rows}",
-                    edit.sources()[index],
-                    field.name
-                ));
+            for sources in [edit.sources(), edit.moment_sources()] {
+                if let Some(index) = sources.iter().position(beyond) {
+                    return wrong(format!(
+                        "new row {index} is made from row {} of `{}`, which has {rows}",
+                        sources[index], field.name
+                    ));
+                }
             }
         }
         for (row, name, width) in edit.widths() {
@@ -115,10 +123,14 @@ impl<M: Module> Optimized<M> {
 
 /// Applies offsets and replacements to gathered rows.
 fn changed(value: Tensor<2>, changes: FieldChanges) -> Tensor<2> {
-    let device = value.device();
+    // Offsets and values are in double precision, whatever the field is in.
+    let (device, dtype) = (value.device(), value.dtype());
     let [n, width] = value.dims();
     let value = match changes.offsets {
-        Some(offsets) => value + Tensor::from_data(TensorData::new(offsets, [n, width]), &device),
+        Some(offsets) => {
+            let offsets = TensorData::new(offsets, [n, width]);
+            value + Tensor::from_data(offsets, (&device, dtype))
+        }
         None => value,
     };
     if changes.set_rows.is_empty() {
@@ -135,7 +147,7 @@ fn changed(value: Tensor<2>, changes: FieldChanges) -> Tensor<2> {
         set[row.clone()].copy_from_slice(values);
         is_set[row].fill(true);
     }
-    let set = Tensor::from_data(TensorData::new(set, [n, width]), &device);
+    let set = Tensor::from_data(TensorData::new(set, [n, width]), (&device, dtype));
     let mask = Tensor::from_data(TensorData::new(is_set, [n, width]), &device);
     value.mask_where(mask, set)
 }

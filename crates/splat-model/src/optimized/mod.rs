@@ -9,7 +9,7 @@ mod tests;
 use std::collections::{BTreeMap, HashMap};
 
 use burn::module::Module;
-use burn::tensor::{Gradients, Tensor, Transaction};
+use burn::tensor::{Element, Gradients, Tensor, Transaction};
 use splat_data::SceneScale;
 use splat_ops::{AdamRows, OpError};
 
@@ -211,6 +211,11 @@ impl<M: Module> Optimized<M> {
         &self.fields
     }
 
+    #[cfg(test)]
+    pub(crate) fn optimizer(&mut self, field: &str) -> &mut FieldOptimizer {
+        self.optimizers.get_mut(field).expect("a field")
+    }
+
     /// Value of a field, `[N, width]`, outside the autodiff graph.
     pub fn field(&self, name: &str) -> Option<Tensor<2>> {
         let mut found = None;
@@ -222,11 +227,27 @@ impl<M: Module> Optimized<M> {
         found
     }
 
-    /// Values of fields on the host, each `[N][width]` flattened, in one transfer.
+    /// Values of fields on the host, each `[N][width]` flattened, in one transfer and in single
+    /// precision.
     ///
     /// # Errors
     /// When the model has no such field, or the device fails.
     pub fn read<const K: usize>(&self, names: [&str; K]) -> Result<[Vec<f32>; K], OpError> {
+        self.read_as(names)
+    }
+
+    /// The same in double precision.
+    ///
+    /// # Errors
+    /// As those of [`read`](Self::read).
+    pub fn read_f64<const K: usize>(&self, names: [&str; K]) -> Result<[Vec<f64>; K], OpError> {
+        self.read_as(names)
+    }
+
+    fn read_as<E: Element, const K: usize>(
+        &self,
+        names: [&str; K],
+    ) -> Result<[Vec<E>; K], OpError> {
         let mut values: BTreeMap<String, Tensor<2>> = BTreeMap::new();
         self.visit(|field, value| {
             if names.contains(&field) {
@@ -250,7 +271,7 @@ impl<M: Module> Optimized<M> {
         })?;
         let mut read = read.into_iter();
         Ok(core::array::from_fn(|_| {
-            let data = read.next().map(|data| data.convert::<f32>());
+            let data = read.next().map(|data| data.convert::<E>());
             data.and_then(|data| data.try_into_vec().ok())
                 .unwrap_or_default()
         }))

@@ -9,7 +9,7 @@ use super::state_record::StateRecord;
 #[derive(Debug, Clone)]
 #[expect(clippy::large_enum_variant, reason = "a handful exist at a time")]
 pub enum MomentEdit {
-    /// Row i continues row `source[i]`, or restarts if `restarts[i]`.
+    /// Row i continues the moments of row `source[i]`, or restarts if `restarts[i]`.
     Gather {
         /// `[N_new]`, indices into the old rows.
         source: Tensor<1, Int>,

@@ -3,12 +3,18 @@
 //! A [`Strategy`] is given to the trainer and called around every step of the optimiser. It sees
 //! gradients, parameters and rows, and may edit rows ([`RowEdit`](crate::RowEdit)), add terms to
 //! the loss, pause and scale the steps of fields, set the first Gaussians and the size of the
-//! photos, and render other training views. [`Adc`] is that of 3DGS.
+//! photos, and render other training views. [`Adc`] is that of 3DGS and AbsGS, [`Mcmc`] that of
+//! Kheradmand et al. 2024.
 
 mod adc;
+mod draw;
+mod mcmc;
 mod relocation;
 mod schedule;
 mod scores;
+mod screen_sums;
+#[cfg(all(test, feature = "cpu"))]
+mod tests;
 
 use burn::tensor::{Device, Tensor};
 use splat_ops::{OpError, Projected, Rendered};
@@ -20,16 +26,20 @@ use crate::{
 };
 
 pub use adc::{Adc, AdcSettings};
+pub use mcmc::{Mcmc, McmcSettings};
 pub use relocation::relocate;
 pub use schedule::{RunSchedule, StepInfo};
 pub use scores::weighted_contributions;
 
-/// What a strategy wants to know of the screen in a step.
+/// Screen gradients that a strategy needs in a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[non_exhaustive]
 pub struct ScreenWants {
     /// Gradients of the packed screen splats, which cost a probe in the graph.
     pub gradients: bool,
+    /// Absolute gradients of the screen means, which cost two sums more in the backward pass of the
+    /// rasteriser.
+    pub absgrad: bool,
 }
 
 impl ScreenWants {
@@ -40,11 +50,22 @@ impl ScreenWants {
 
     /// The gradients of the screen splats.
     pub fn gradients() -> Self {
-        Self { gradients: true }
+        Self {
+            gradients: true,
+            ..Self::nothing()
+        }
+    }
+
+    /// The absolute gradients of the screen means.
+    pub fn absgrad() -> Self {
+        Self {
+            absgrad: true,
+            ..Self::nothing()
+        }
     }
 }
 
-/// What a training view of a step left on the screen.
+/// The splats of one training view of a step, and their gradients.
 #[derive(Debug)]
 pub struct ScreenView {
     /// Index of the view among those that are trained on.
@@ -54,6 +75,9 @@ pub struct ScreenView {
     /// Gradient `[C, N, 9]` of their packed rows, of the loss of this view alone, where the
     /// strategy wanted it.
     pub gradient: Option<Tensor<3>>,
+    /// Absolute gradient `[C, N, 2]` of their screen means, likewise, see
+    /// [`Projected::with_absgrad`].
+    pub absgrad: Option<Tensor<3>>,
 }
 
 /// A rendered training view, before the backward pass.
@@ -71,7 +95,7 @@ pub struct Pass<'a, M> {
     pub rendered: &'a Rendered,
 }
 
-/// What a strategy may see and change around a step of the optimiser.
+/// The state that a strategy can read and change around a step of the optimiser.
 pub struct StepContext<'a, M> {
     /// How many steps are done: before the optimiser, those before this step; after it, this one
     /// too.
@@ -100,7 +124,7 @@ pub trait TrainingViews {
     fn photo(&self, view: usize) -> Tensor<4>;
 }
 
-/// What a change of rows did.
+/// Counts of a change of rows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Refinement {
     /// Gaussians that were duplicated.
@@ -143,7 +167,7 @@ pub struct Refinement {
 /// }
 /// ```
 pub trait Strategy<M: SplatModel>: Send {
-    /// What a checkpoint calls it: a run goes on with the strategy that it was begun with. Default:
+    /// Its name in a checkpoint: a run resumes with the strategy that it began with. Default:
     /// the type's name.
     fn name(&self) -> String {
         core::any::type_name::<Self>().to_owned()
@@ -153,7 +177,7 @@ pub trait Strategy<M: SplatModel>: Send {
     /// fields.
     ///
     /// # Errors
-    /// What is wrong, in a line.
+    /// The problem, in one line.
     fn check(&self, _fields: &[Field]) -> Result<(), String> {
         Ok(())
     }
@@ -168,7 +192,7 @@ pub trait Strategy<M: SplatModel>: Send {
         None
     }
 
-    /// What of the screen is wanted at a step.
+    /// Screen gradients needed at a step.
     fn screen_wants(&self, _at: &StepInfo) -> ScreenWants {
         ScreenWants::nothing()
     }
@@ -186,7 +210,7 @@ pub trait Strategy<M: SplatModel>: Send {
         Ok(Vec::new())
     }
 
-    /// What the optimiser does with a field at a step.
+    /// How the optimiser treats a field at a step.
     fn field_step(&self, _at: &StepInfo, _field: &Field) -> FieldStep {
         FieldStep::Step(1.0)
     }
@@ -207,7 +231,7 @@ pub trait Strategy<M: SplatModel>: Send {
     /// As those of the ops that it uses.
     fn after_step(&mut self, context: &mut StepContext<M>) -> Result<Option<Refinement>, OpError>;
 
-    /// What a checkpoint must keep of it: numbers, and tensors of floats, which are kept in single
+    /// State to keep in a checkpoint: numbers, and tensors of floats, which are kept in single
     /// precision and must be finite.
     ///
     /// # Errors
@@ -219,7 +243,7 @@ pub trait Strategy<M: SplatModel>: Send {
     /// Puts back what [`save`](Self::save) gave, for a model of `rows` Gaussians.
     ///
     /// # Errors
-    /// What is wrong with it, in a line.
+    /// The problem with the record, in one line.
     fn restore(
         &mut self,
         _record: StateRecord,

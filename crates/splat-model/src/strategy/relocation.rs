@@ -2,6 +2,9 @@
 //! Gaussian Splatting as Markov Chain Monte Carlo*, section 3.3 and eq. 9).
 
 use core::f64::consts::PI;
+use core::ops::RangeInclusive;
+
+use super::draw;
 
 /// Opacity of each of `copies` Gaussians in one place that replace one of `opacity`, and the factor
 /// of their scales.
@@ -15,15 +18,45 @@ use core::f64::consts::PI;
 /// that is never negative, `∫ 1 - (1 - o' exp(-x²))^N dx / √π`, and is taken as that; the
 /// trapezoidal rule on it converges geometrically. Opacities outside [0, 1] are clamped; no copies
 /// at all count as one.
+///
+/// ```
+/// let (opacity, factor) = splat_model::strategy::relocate(0.75, 2);
+/// assert!((opacity - 0.5).abs() < 1e-12 && 0.8 < factor && factor < 1.0);
+/// ```
 pub fn relocate(opacity: f64, copies: usize) -> (f64, f64) {
     let opacity = opacity.clamp(0.0, 1.0);
-    let n = copies.max(1) as f64;
     // Neither end cancels: ln(1 - o) and e^x - 1 are taken as functions of their own.
-    let shared = -((-opacity).ln_1p() / n).exp_m1();
-    if opacity == 0.0 {
-        return (0.0, 1.0);
+    let shared = -((-opacity).ln_1p() / copies.max(1) as f64).exp_m1();
+    (shared, scale_factor(opacity, shared, copies))
+}
+
+/// The same in terms of logits, with o' kept within bounds, of which the scale then follows: the
+/// logit of o', and the factor of the scales. An opacity next to one loses its digits, its logit
+/// does not.
+pub(super) fn relocate_logit(
+    logit: f64,
+    copies: usize,
+    bounds: &RangeInclusive<f64>,
+) -> (f64, f64) {
+    // ln(1 - o) and that of each copy.
+    let shade = -(logit.max(0.0) + (-logit.abs()).exp().ln_1p());
+    let each = shade / copies.max(1) as f64;
+    let shared = -each.exp_m1();
+    let (shared, logit_of_each) = match shared {
+        low if low < *bounds.start() => (*bounds.start(), draw::logit(*bounds.start())),
+        high if high > *bounds.end() => (*bounds.end(), draw::logit(*bounds.end())),
+        shared => (shared, shared.ln() - each),
+    };
+    let factor = scale_factor(draw::sigmoid(logit), shared, copies);
+    (logit_of_each, factor)
+}
+
+/// `s' / s`, given the opacity of the one, and that of each copy.
+fn scale_factor(opacity: f64, shared: f64, copies: usize) -> f64 {
+    match opacity == 0.0 || shared == 0.0 {
+        true => 1.0,
+        false => opacity / together(shared, copies.max(1) as f64),
     }
-    (shared, opacity / together(shared, n))
 }
 
 /// `∫ 1 - (1 - o exp(-x²))^n dx / √π`.
@@ -87,6 +120,37 @@ mod tests {
             let (s, f) = relocate(opacity, 51);
             assert!((s / shared - 1.0).abs() < 1e-12, "{opacity}: {s:e}");
             assert!((f / factor - 1.0).abs() < 1e-12, "{opacity}: {f:e}");
+        }
+    }
+
+    /// Against Python's decimal arithmetic (`tests/fixtures/relocation.py`), with gsplat's bounds
+    /// and without, at opacities from 0.005 to one less 1e-13, for up to a thousand copies.
+    #[test]
+    fn relocation_agrees_with_decimal_arithmetic() {
+        let file = splat_test_support::Reference::read("strategies/relocation_formula");
+        let most = file.number("most_copies") as usize;
+        let logits = file.values("opacity_logits");
+        let bounds = [
+            (
+                "clamped",
+                file.number("min_opacity")..=1.0 - f64::from(f32::EPSILON),
+            ),
+            ("unclamped", 0.0..=1.0),
+        ];
+        for (prefix, bounds) in bounds {
+            let ours = logits.iter().zip(file.indices("copies"));
+            let ours = ours.map(|(logit, n)| relocate_logit(*logit, n.min(most), &bounds));
+            let (ours, factors): (Vec<f64>, Vec<f64>) = ours.unzip();
+            for (name, ours) in [("opacity_logits", ours), ("scale_factors", factors)] {
+                let expected = file.values(&format!("{prefix}.{name}"));
+                for (ours, expected) in ours.iter().zip(expected) {
+                    let error = (ours - expected).abs() / expected.abs().max(1.0);
+                    assert!(
+                        error < 1e-11,
+                        "{prefix} {name}: {ours} instead of {expected}"
+                    );
+                }
+            }
         }
     }
 

@@ -1,4 +1,4 @@
-//! What of a run its strategy needs to know.
+//! Facts about a run that its strategy needs.
 
 use splat_data::SceneScale;
 

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use burn::tensor::Device;
 use splat_data::{Capture, SceneScale, SplatData, View};
 use splat_model::optimizer::{FieldOptimizer, SplatAdam};
-use splat_model::strategy::{Adc, RunSchedule, Strategy};
+use splat_model::strategy::{Adc, Mcmc, RunSchedule, Strategy};
 use splat_model::{Field, Gaussians, Optimized, SplatModel};
 
 use super::checkpoint::RunRecord;
@@ -20,8 +20,8 @@ use super::state::State;
 use super::trainer::Trainer;
 use super::watch::{Autosave, Watch};
 use super::{
-    Checkpoint, CheckpointError, History, IntoLoss, LossTerms, Progress, TrainError, TrainSettings,
-    Warning, resolution_schedule, views,
+    Checkpoint, CheckpointError, History, IntoLoss, LossTerms, Progress, StrategyKind, TrainError,
+    TrainSettings, Warning, resolution_schedule, views,
 };
 use crate::hooks::{Hook, Hooks};
 
@@ -99,8 +99,8 @@ impl<M: SplatModel> TrainerBuilder<M> {
         self
     }
 
-    /// Which Gaussians there are, and what else changes from step to step. Default: [`Adc`] with
-    /// the settings' `density`.
+    /// Which Gaussians there are, and what else changes from step to step. Default: that of the
+    /// settings, with the settings for it.
     pub fn strategy(mut self, strategy: impl Strategy<M> + 'static) -> Self {
         self.strategy = Some(Box::new(strategy));
         self
@@ -123,7 +123,7 @@ impl<M: SplatModel> TrainerBuilder<M> {
         self
     }
 
-    /// What to minimise: a closure `|view, rendered| -> Result<Tensor<1>, OpError>` or
+    /// The loss to minimise: a closure `|view, rendered| -> Result<Tensor<1>, OpError>` or
     /// [`LossTerms`]. Default: [`LossTerms::l1_ssim`].
     pub fn loss(mut self, loss: impl IntoLoss) -> Self {
         self.loss = Some(loss.into_loss());
@@ -208,10 +208,14 @@ impl<M: SplatModel> TrainerBuilder<M> {
             changes: Vec::new(),
         };
         let mut config = self.config;
-        let most = config.density.max_gaussians;
-        config.density.max_gaussians = most.or_else(|| Some(default_max_gaussians(&self.capture)));
+        if config.max_gaussians().is_none() {
+            config.set_max_gaussians(default_max_gaussians(&self.capture));
+        }
         let strategy = self.strategy.take();
-        let strategy = strategy.unwrap_or_else(|| Box::new(Adc::new(config.density.clone())));
+        let strategy = strategy.unwrap_or_else(|| match config.strategy {
+            StrategyKind::Adc => Box::new(Adc::new(config.density.clone())),
+            StrategyKind::Mcmc => Box::new(Mcmc::new(config.mcmc.clone())),
+        });
         let mut terms: Vec<String> = loss.names().map(str::to_owned).collect();
         terms.extend(strategy.loss_term_names());
 

@@ -34,6 +34,6 @@ pub use history::{History, LossRecord};
 pub use loss::{IntoLoss, LossTerms, TargetView};
 pub use loss_log::LOSS_BATCH;
 pub use progress::{Progress, Trained};
-pub use settings::TrainSettings;
+pub use settings::{StrategyKind, TrainSettings};
 pub use trainer::Trainer;
 pub use warnings::Warning;

@@ -5,12 +5,12 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 use splat_model::ops::{AdamRows, ClampGradient, RasterizeSettings};
-use splat_model::strategy::AdcSettings;
+use splat_model::strategy::{AdcSettings, McmcSettings};
 use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale};
 
 use splat_data::text::{one_line, utf8};
 
-/// What has more bytes is no file of settings, and reading it as one could take all memory.
+/// Larger files are refused: parsing one could exhaust memory.
 const LONGEST: usize = 1 << 20;
 /// Beyond this, images shrink to nothing.
 const MOST_HALVINGS: u32 = 8;
@@ -40,7 +40,7 @@ pub struct TrainSettings {
     /// step (3DGS section 7.1 has 2: a quarter, then a half). Default 0: photos are as they are
     /// from the beginning.
     pub coarse_halvings: u32,
-    /// So many steps of a run of 30,000 until the sides are doubled. Default 250.
+    /// Steps between two doublings of the sides, in a run of 30,000. Default 250.
     pub coarse_every: usize,
     /// One more degree of spherical harmonics every so many steps of a run of 30,000. Default
     /// 1,000.
@@ -59,16 +59,33 @@ pub struct TrainSettings {
     /// Whether a run repeats bit for bit on a CubeCL device; false saves memory there, see
     /// [`RasterizeSettings::deterministic`]. On the CPU it always does. Default true.
     pub deterministic: bool,
+    /// Which Gaussians there are, where the trainer is given no strategy of its own. Default
+    /// `adc`.
+    pub strategy: StrategyKind,
     /// The first Gaussians.
     pub init: InitSettings,
     /// Learning rates; called `rates` in older files.
     #[serde(alias = "rates")]
     pub learning_rates: LearningRates,
-    /// Adaptive density control. Where `max_gaussians` is absent, growth ends at seven Gaussians
-    /// for every ten pixels of a photo, or one for every hundred of all photos that are trained on
-    /// (300 values for up to 59 parameters), whichever is more; docs/TRAINING.md has what more
-    /// would give.
+    /// Adaptive density control, the strategy `adc`. Where `max_gaussians` is absent, growth ends
+    /// at seven Gaussians for every ten pixels of a photo, or one for every hundred of all photos
+    /// that are trained on (300 values for up to 59 parameters), whichever is more;
+    /// docs/TRAINING.md has what more would give.
     pub density: AdcSettings,
+    /// The strategy `mcmc`. Where `max_gaussians` is absent, growth ends as it does for `density`.
+    pub mcmc: McmcSettings,
+}
+
+/// A strategy of this crate.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum StrategyKind {
+    /// [`Adc`](splat_model::strategy::Adc): adaptive density control; with `density.absgrad` that
+    /// of AbsGS.
+    #[default]
+    Adc,
+    /// [`Mcmc`](splat_model::strategy::Mcmc).
+    Mcmc,
 }
 
 impl TrainSettings {
@@ -93,16 +110,18 @@ impl Default for TrainSettings {
             ssim_weight: 0.2,
             seen_rows_only: false,
             deterministic: true,
+            strategy: StrategyKind::default(),
             init: InitSettings::default(),
             learning_rates: LearningRates::default(),
             density: AdcSettings::default(),
+            mcmc: McmcSettings::default(),
         }
     }
 }
 
 impl TrainSettings {
     /// Reads a `config.toml`, a byte-order mark before it or not; or says in a line what is wrong
-    /// with it. What it does not name is as by default.
+    /// with it. Settings that it does not name have their defaults.
     ///
     /// # Errors
     /// When it is no text, no TOML, or names what is no setting.
@@ -114,6 +133,22 @@ impl TrainSettings {
             ));
         }
         toml::from_str(utf8(bytes)?).map_err(|error| one_line(&error.to_string()))
+    }
+
+    /// The limit of growth of the strategy.
+    pub fn max_gaussians(&self) -> Option<usize> {
+        match self.strategy {
+            StrategyKind::Adc => self.density.max_gaussians,
+            StrategyKind::Mcmc => self.mcmc.max_gaussians,
+        }
+    }
+
+    /// Limits the growth of the strategy.
+    pub fn set_max_gaussians(&mut self, most: usize) {
+        match self.strategy {
+            StrategyKind::Adc => self.density.max_gaussians = Some(most),
+            StrategyKind::Mcmc => self.mcmc.max_gaussians = Some(most),
+        }
     }
 
     /// The settings that `other` has otherwise: name, value here, value there, as TOML has them.
@@ -166,11 +201,12 @@ impl TrainSettings {
     /// Checks that the settings can be used.
     ///
     /// # Errors
-    /// What makes them unusable: the field and the reason, in a line.
+    /// The field and why its value cannot be used, in one line.
     pub fn validate(&self) -> Result<(), String> {
         self.check_counts()?;
         self.check_rates_and_shares()?;
         self.check_reachable_opacities()?;
+        (self.mcmc.validate()).map_err(|problem| problem.replacen('`', "`mcmc.", 1))?;
         if let Some(color) = self.background
             && !color.iter().all(|channel| channel.is_finite())
         {
@@ -239,7 +275,7 @@ impl TrainSettings {
         }
         // Infinity is a way to say never.
         let not_negative = [
-            ("density.grow_gradient", self.density.grow_gradient),
+            ("density.grow_gradient", self.density.threshold()),
             ("density.split_scale", self.density.split_scale),
             ("density.prune_scale", self.density.prune_scale),
         ];
@@ -265,6 +301,7 @@ impl TrainSettings {
         let starts = [
             ("init.opacity", self.init.opacity),
             ("density.reset_opacity", self.density.reset_opacity),
+            ("mcmc.init_opacity", self.mcmc.init_opacity),
         ];
         if let Some((field, value)) = starts.iter().find(|(_, value)| *value <= cut) {
             return Err(format!(
@@ -377,12 +414,16 @@ mod tests {
         }
         let found = problem(&|config| config.steps = usize::MAX);
         assert!(found.contains("`steps` must be at most"), "{found}");
-        let found = problem(&|config| config.density.grow_gradient = f64::NAN);
+        let found = problem(&|config| config.density.grow_gradient = Some(f64::NAN));
         assert!(found.contains("`density.grow_gradient`"), "{found}");
         let found = problem(&|config| config.density.prune_scale = -1.0);
         assert!(found.contains("`density.prune_scale`"), "{found}");
         let found = problem(&|config| config.density.reset_opacity = 0.0);
         assert!(found.contains("`density.reset_opacity`"), "{found}");
+        let found = problem(&|config| config.mcmc.init_opacity = 0.001);
+        assert!(found.contains("`mcmc.init_opacity`"), "{found}");
+        let found = problem(&|config| config.mcmc.growth = 0.5);
+        assert!(found.contains("`mcmc.growth`"), "{found}");
         assert_eq!(
             problem(&|config| config.density.split_scale = f64::INFINITY),
             ""

@@ -1,4 +1,4 @@
-//! What changes during a run.
+//! The state of a run.
 
 use std::time::Duration;
 

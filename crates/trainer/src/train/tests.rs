@@ -1,6 +1,7 @@
 //! Runs on the example capture.
 
 mod extensions;
+mod strategies;
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};

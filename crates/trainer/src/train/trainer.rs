@@ -70,7 +70,8 @@ struct Measured {
     loss: Tensor<1>,
     terms: Vec<Tensor<1>>,
     projected: Projected,
-    probe: Option<Tensor<3>>,
+    /// Leaves for the gradients of the splats, and for their absolute gradients.
+    probes: [Option<Tensor<3>>; 2],
 }
 
 impl<M: SplatModel> Trainer<M> {
@@ -139,16 +140,21 @@ impl<M: SplatModel> Trainer<M> {
         let mut gradients = trace_span!("backward").in_scope(|| loss.backward());
         let screen: Vec<ScreenView> = screen
             .into_iter()
-            .map(|(view, projected, probe)| ScreenView {
-                view,
-                projected,
-                gradient: probe
-                    .and_then(|probe| probe.grad_remove(&mut gradients))
-                    // Of the view's own loss, of which that of the step is a share.
-                    .map(|gradient| match count {
+            .map(|(view, projected, probes)| {
+                let [gradient, absgrad] = probes.map(|probe| {
+                    let gradient = probe?.grad_remove(&mut gradients)?;
+                    // Scaled back to the view's own loss: the step's loss is the mean.
+                    Some(match count {
                         1 => gradient,
                         _ => gradient * count as f64,
-                    }),
+                    })
+                });
+                ScreenView {
+                    view,
+                    projected,
+                    gradient,
+                    absgrad,
+                }
             })
             .collect();
         let mut fields = self.state.model.gradients(&mut gradients);
@@ -168,7 +174,7 @@ impl<M: SplatModel> Trainer<M> {
         self.step_fields(fields, &at)?;
         self.losses.push(unread);
         self.state.step += 1;
-        // What would be added after the last step would never be trained.
+        // Gaussians added after the last step would never be trained.
         if self.state.step < self.config.steps {
             let done = StepInfo {
                 step: self.state.step,
@@ -205,10 +211,14 @@ impl<M: SplatModel> Trainer<M> {
 
         let render = trace_span!("render").entered();
         let mut projected = project_gaussians(model, &cameras, &settings)?;
-        let mut probe = None;
+        let mut probes = [None, None];
         if wants.gradients {
             let (probed, leaf) = projected.with_screen_probe();
-            (projected, probe) = (probed, Some(leaf));
+            (projected, probes[0]) = (probed, Some(leaf));
+        }
+        if wants.absgrad {
+            let (probed, leaf) = projected.with_absgrad();
+            (projected, probes[1]) = (probed, Some(leaf));
         }
         let background = hooks.background(&hook_view, &cameras)?;
         let rendered = render_projected_on(model, &projected, &cameras, background, &settings)?;
@@ -250,7 +260,7 @@ impl<M: SplatModel> Trainer<M> {
             loss,
             terms,
             projected,
-            probe,
+            probes,
         })
     }
 
@@ -263,7 +273,7 @@ impl<M: SplatModel> Trainer<M> {
         let mut sums: Option<(Tensor<1>, Vec<Tensor<1>>)> = None;
         for one in measured {
             views.push(self.capture.split.train[one.training_index]);
-            screen.push((one.training_index, one.projected, one.probe));
+            screen.push((one.training_index, one.projected, one.probes));
             sums = Some(match sums {
                 None => (one.loss, one.terms),
                 Some((loss, terms)) => {
@@ -371,7 +381,7 @@ impl<M: SplatModel> Trainer<M> {
 type Together = (
     Tensor<1>,
     UnreadLoss,
-    Vec<(usize, Projected, Option<Tensor<3>>)>,
+    Vec<(usize, Projected, [Option<Tensor<3>>; 2])>,
 );
 
 /// When the strategy looks.

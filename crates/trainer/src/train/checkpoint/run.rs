@@ -6,8 +6,8 @@ use super::super::TrainSettings;
 use super::super::fingerprint::Fingerprint;
 use super::{Checkpoint, CheckpointError};
 
-/// Settings that a resumed run may change: its length, and the limit of growth.
-const CHANGEABLE: [&str; 2] = ["steps", "density.max_gaussians"];
+/// Settings that a resumed run may change: its length, and the limits of growth.
+const CHANGEABLE: [&str; 3] = ["steps", "density.max_gaussians", "mcmc.max_gaussians"];
 
 /// A run without its state: its settings and its capture.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -27,9 +27,9 @@ impl Checkpoint {
     }
 
     /// Checks that a run with these settings is the run of this checkpoint, and has steps left.
-    /// Only `steps` and `density.max_gaussians` may differ. Any other change, including the seed
-    /// and the initial Gaussians, would make a run that nobody could repeat, and would partly have
-    /// no effect.
+    /// Only `steps` and the strategies' `max_gaussians` may differ. Any other change, including the
+    /// seed and the initial Gaussians, would make a run that nobody could repeat, and would partly
+    /// have no effect.
     ///
     /// # Errors
     /// [`CheckpointError::OtherSettings`] and [`CheckpointError::NothingLeft`].
@@ -37,6 +37,7 @@ impl Checkpoint {
         let mut same = config.clone();
         same.steps = self.settings().steps;
         same.density.max_gaussians = self.settings().density.max_gaussians;
+        same.mcmc.max_gaussians = self.settings().mcmc.max_gaussians;
         if let Some(difference) = self.settings().difference_in_words(&same) {
             return Err(CheckpointError::OtherSettings {
                 path: self.path.clone(),
