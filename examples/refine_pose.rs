@@ -1,123 +1,79 @@
-//! Finds back a camera that was moved, by gradient descent through the renderer: the gradients of
-//! poses are those of any other input. To run it: `cargo run --release --example refine_pose`
+//! Finds a camera back that was turned and shifted, by comparing renders of a trained scene with
+//! the photo: `project` and `rasterize` give the gradient of the pose like any other.
+//!
+//! The picture: what the moved and the found camera see, each alone and over the photo; the photo.
+//! Run it: `cargo run --release --example refine_pose [STEPS [FOLDER [CAPTURE]]]`
 
-use burn_splat::model::{InitSettings, splats_from_points};
+mod common;
+
+use burn::optim::Optimizer;
 use burn_splat::prelude::*;
-use glam::{DMat4, DQuat, DVec2, DVec3};
 
-/// The capture's points as small Gaussians.
-fn scene(capture: &Capture, device: &Device) -> Result<Gaussians, Box<dyn std::error::Error>> {
-    let points = capture.points.iter();
-    let (positions, colors): (Vec<_>, Vec<_>) = points
-        .map(|point| (point.position.map(|x| x as f32), point.color))
-        .unzip();
-    let scale = SceneScale::new(1.0).ok_or("a positive size")?;
-    let settings = InitSettings::new()
-        .with_opacity(0.8)
-        .with_scale(0.2)
-        .with_sh_degree(0);
-    let splats = splats_from_points(&positions, &colors, scale, &settings)?;
-    Ok(Gaussians::from_data(&splats, device))
+/// The rigid motion `exp(M)`, `[1, 4, 4]`, of a twist `[6]`: turns about three axes in radians,
+/// then shifts along them in sizes of the scene.
+fn motion(twist: Tensor<1>, scene: SceneScale) -> Tensor<3> {
+    let mut generators = [[0.0; 16]; 6];
+    for (axis, [i, j]) in [[1, 2], [2, 0], [0, 1]].into_iter().enumerate() {
+        (generators[axis][4 * j + i], generators[axis][4 * i + j]) = (1.0, -1.0);
+        generators[3 + axis][4 * axis + 3] = scene.length() as f32;
+    }
+    let generators = Tensor::from_floats(generators, &twist.device());
+    let m = twist.unsqueeze::<2>().matmul(generators).reshape([1, 4, 4]);
+    let identity = Tensor::<2>::eye(4, &m.device()).unsqueeze();
+    // I + M (I + M/2 (I + M/3 (...))), the series of the exponential.
+    let add = |sum, k| identity.clone() + m.clone().matmul(sum) / k;
+    [4, 3, 2, 1].into_iter().fold(identity.clone(), add)
 }
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let settings = CaptureSettings::new().with_downscale(4);
-    let capture = Capture::load("examples/data/saharov", &settings)?;
+    let args = common::Arguments::read(1000, "examples/data/saharov")?;
+    let capture = Capture::load(&args.input, &CaptureSettings::new().with_downscale(2))?;
+    let trainer = Trainer::builder(capture.clone()).device(Device::flex());
+    let settings = TrainSettings::new().with_steps(args.size);
+    let trainer = trainer.settings(settings).build()?;
+    let scale = trainer.scene_scale();
+    let trained = trainer.run()?;
+
+    // The scene is constant now, and its render a function of the pose.
+    let (scene, settings) = (trained.model.train().no_grad(), trained.render_settings);
     let device = Device::flex().autodiff();
-    let gaussians = scene(&capture, &device)?.no_grad();
-    let truth = capture.views[0].camera();
-    let rendering = RenderSettings::new();
-    let target = CameraTensors::from_camera(&truth, &device);
-    let target = render(&gaussians, &target, &rendering)?.image();
-
-    let turn = DQuat::from_rotation_y(0.03);
-    let moved = DMat4::from_rotation_translation(turn, DVec3::new(0.02, -0.01, 0.0));
-    let mut camera = Camera {
-        viewmat: moved * truth.viewmat,
-        ..truth
+    let view = capture.test_views().next().ok_or("no view is held out")?;
+    let camera = CameraTensors::from_camera(&view.camera().relative_to(scene.origin), &device);
+    let look = |viewmats: Tensor<3>| -> Result<(Projected, Tensor<4>), OpError> {
+        let mut camera = camera.clone();
+        camera.viewmats = viewmats.clone();
+        let (means, quats, scales) = (scene.means(), scene.quats(), scene.scales());
+        let (intrinsics, size, how) = (camera.intrinsics.clone(), camera.size, &settings.project);
+        let splats = project(means, quats, scales, viewmats, intrinsics, size, how)?;
+        let (colors, opacities) = (scene.colors(camera.centers(), 3, None)?, scene.opacities());
+        let rendered = rasterize(&splats, colors, opacities, None, &settings.rasterize)?;
+        Ok((splats, rendered.image()))
     };
-    // How far points lie from their places in the picture, in pixels.
-    let off = |camera: &Camera| {
-        let points = capture
-            .points
-            .iter()
-            .map(|point| DVec3::from(point.position));
-        let distances: Vec<f64> = points
-            .map(|point| (pixel(camera, point) - pixel(&truth, point)).length())
-            .collect();
-        distances.iter().sum::<f64>() / distances.len() as f64
-    };
-    let before = off(&camera);
-    let mut adam = PoseAdam::default();
-    for step in 0..STEPS {
-        let mut tensors = CameraTensors::from_camera(&camera, &device);
-        tensors.viewmats = tensors.viewmats.require_grad();
-        let image = render(&gaussians, &tensors, &rendering)?.image();
-        let loss = (image - target.clone()).square().mean();
-        let gradient = tensors.viewmats.grad(&loss.backward());
-        let gradient = gradient.ok_or("the picture depends on the pose")?;
-        let gradient: Vec<f32> = gradient.into_data().try_into_vec()?;
-        camera.viewmat = adam.step(camera.viewmat, &gradient, step);
-        if step % 50 == 0 {
-            let loss = loss.into_scalar::<f32>();
-            println!(
-                "step {step:3}: loss {loss:.2e}, {:.3} pixels off",
-                off(&camera)
-            );
-        }
+
+    let photo = burn_splat::train::photo(view, &device);
+    let (there, _) = look(camera.viewmats.clone())?;
+    let shake = Tensor::from_floats([0.02, -0.04, 0.03, 0.02, -0.01, 0.03], &device);
+    let moved = motion(shake, scale).matmul(camera.viewmats.clone());
+    let mut twist = Tensor::zeros([6], &device).require_grad();
+    let (adam, mut state) = (SplatAdam::new(), None);
+    for step in 0..args.size {
+        let (_, image) = look(motion(twist.clone(), scale).matmul(moved.clone()))?;
+        let gradients = losses::l1(image, photo.clone()).backward();
+        let gradient = twist.grad(&gradients).ok_or("no splat is in view")?;
+        let rate = 3e-3 * 0.01f64.powf(step as f64 / args.size as f64);
+        let (stepped, after) = adam.step(rate, twist.inner(), gradient, state);
+        (twist, state) = (Tensor::from_inner(stepped).require_grad(), after);
     }
-    println!("{before:.3} pixels off before, {:.3} after", off(&camera));
-    if off(&camera) < 0.1 * before {
-        return Ok(());
+
+    let mut images = Vec::new();
+    for pose in [moved.clone(), motion(twist, scale).matmul(moved)] {
+        let (splats, image) = look(pose)?;
+        let seen = (splats.depths() * there.depths()).sign(); // Out of view depths are 0.
+        let squares = (splats.means2d() - there.means2d()).square().sum_dim(2);
+        let off = (squares.sqrt().squeeze_dim(2) * seen.clone()).sum() / seen.sum();
+        println!("off by {:.2} pixels", off.into_scalar::<f32>());
+        images.extend([image.clone(), (image + photo.clone()) / 2.0]);
     }
-    Err("the camera was not found back".into())
-}
-
-const STEPS: usize = 300;
-
-/// Where a camera sees a point.
-fn pixel(camera: &Camera, point: DVec3) -> DVec2 {
-    let seen = camera.viewmat.transform_point3(point);
-    let [fx, fy, cx, cy] = camera.intrinsics;
-    DVec2::new(fx * seen.x / seen.z + cx, fy * seen.y / seen.z + cy)
-}
-
-/// Adam on the six numbers of a small motion of the camera: a turn and a shift in its own frame.
-#[derive(Default)]
-struct PoseAdam {
-    first: [f64; 6],
-    second: [f64; 6],
-}
-
-impl PoseAdam {
-    fn step(&mut self, viewmat: DMat4, gradient: &[f32], step: usize) -> DMat4 {
-        let entry = |row: usize, column: usize| f64::from(gradient[row * 4 + column]);
-        // dL/d(motion) of `motion * viewmat`, whose first rows are those of G V^T.
-        let product = |row: usize, column: usize| -> f64 {
-            let terms = (0..4).map(|k| entry(row, k) * viewmat.row(column)[k]);
-            terms.sum()
-        };
-        let motion = [
-            product(2, 1) - product(1, 2),
-            product(0, 2) - product(2, 0),
-            product(1, 0) - product(0, 1),
-            product(0, 3),
-            product(1, 3),
-            product(2, 3),
-        ];
-        let time = step as i32 + 1;
-        let rate = 2e-3 * 0.01f64.powf(step as f64 / STEPS as f64);
-        let moved: Vec<f64> = (0..6)
-            .map(|k| {
-                self.first[k] = 0.9 * self.first[k] + 0.1 * motion[k];
-                self.second[k] = 0.99 * self.second[k] + 0.01 * motion[k].powi(2);
-                let mean = self.first[k] / (1.0 - 0.9f64.powi(time));
-                let size = (self.second[k] / (1.0 - 0.99f64.powi(time))).sqrt();
-                -rate * mean / (size + 1e-12)
-            })
-            .collect();
-        let turn = DQuat::from_scaled_axis(DVec3::new(moved[0], moved[1], moved[2]));
-        let shift = DVec3::new(moved[3], moved[4], moved[5]);
-        DMat4::from_rotation_translation(turn, shift) * viewmat
-    }
+    images.push(photo);
+    args.save("refine_pose", &images)
 }

@@ -1,5 +1,12 @@
-//! Swaps the loss: Charbonnier plus the edges' differences instead of L1 + D-SSIM. To run it:
-//! `cargo run --release --example swap_loss [CAPTURE [STEPS]]`
+//! Swaps the loss of a training run: Charbonnier plus differences of edges, instead of the L1 and
+//! SSIM of 3DGS. A loss is a closure on tensors, or a list of named and weighted ones.
+//!
+//! The picture, of a held-out view: loss of 3DGS, own loss, the photo.
+//! Run it: `cargo run --release --example swap_loss [STEPS [FOLDER [CAPTURE]]]`
+
+mod common;
+
+use std::error::Error;
 
 use burn_splat::prelude::*;
 
@@ -8,46 +15,42 @@ fn charbonnier(difference: Tensor<4>) -> Tensor<1> {
     (difference.square() + 1e-6).sqrt().mean()
 }
 
-/// Differences of neighbouring pixels along an axis of `[B, H, W, D]`.
+/// Differences of neighbouring pixels along an axis of `[1, H, W, 3]`.
 fn edges(image: Tensor<4>, axis: usize) -> Tensor<4> {
     let length = image.dims()[axis] - 1;
     image.clone().narrow(axis, 1, length) - image.narrow(axis, 0, length)
 }
 
-fn main() -> Result<(), Box<dyn std::error::Error>> {
-    let mut arguments = std::env::args().skip(1);
-    let folder = arguments.next().unwrap_or("examples/data/saharov".into());
-    let steps = arguments.next().map_or(Ok(300), |steps| steps.parse())?;
-    let capture = Capture::load(folder, &CaptureSettings::new().with_downscale(2))?;
-    let config = TrainSettings::new().with_steps(steps);
-    let loss = LossTerms::new()
+fn own_loss() -> LossTerms {
+    LossTerms::new()
         .term("charbonnier", 0.8, |view, rendered| {
             Ok(charbonnier(rendered.image() - view.image()))
         })
         .term("edges", 0.2, |view, rendered| {
             let along = |axis| edges(rendered.image(), axis) - edges(view.image(), axis);
             Ok(charbonnier(along(1)) + charbonnier(along(2)))
-        });
-    let trained = Trainer::builder(capture.clone())
-        .settings(config)
-        .device(Device::flex())
-        .loss(loss)
-        .on_progress(|p| match p.history.losses.last() {
-            Some(l) if p.step % 50 == 0 => {
-                println!("{:5} {:?} {:?}", p.step, p.history.terms, l.terms)
-            }
-            _ => {}
         })
-        .build()?
-        .run()?;
-    let views: Vec<_> = capture.test_views().collect();
-    let scores = evaluate(
-        &trained.model,
-        &views,
-        &trained.render_settings,
-        &Device::flex(),
-        |_, _| {},
-    )?;
-    println!("held out: {:.2} dB, SSIM {:.4}", scores.psnr, scores.ssim);
-    Ok(())
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let args = common::Arguments::read(1000, "examples/data/saharov")?;
+    let capture = Capture::load(&args.input, &CaptureSettings::new().with_downscale(2))?;
+    let views: Vec<&View> = capture.test_views().collect();
+    let train = |name: &str, loss: LossTerms| -> Result<[Tensor<4>; 2], Box<dyn Error>> {
+        let trained = Trainer::builder(capture.clone())
+            .settings(TrainSettings::new().with_steps(args.size))
+            .device(Device::flex())
+            .loss(loss)
+            .build()?
+            .run()?;
+        let scores = trained.evaluate(&views, &Device::flex(), |_, _| {})?;
+        println!(
+            "{name} loss: held out {:.2} dB, SSIM {:.4}",
+            scores.psnr, scores.ssim
+        );
+        common::held_out(&capture, &trained)
+    };
+    let [_, usual] = train("3DGS", LossTerms::l1_ssim(0.2))?;
+    let [photo, own] = train("own", own_loss())?;
+    args.save("swap_loss", &[usual, own, photo])
 }

@@ -39,6 +39,7 @@
 //! | [`ops::adam_step`] | one step of Adam on one parameter |
 //! | [`ops::exp`], [`ops::sigmoid`] | the activations of scales and opacities |
 //! | [`ops::ScreenStatistics`] | per-Gaussian sums for density control |
+//! | [`ops::perturb_means`] | noise on the means, for MCMC |
 //!
 //! # Types
 //!

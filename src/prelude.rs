@@ -7,14 +7,17 @@ pub use burn::tensor::{Device, Gradients, Int, Tensor, TensorData};
 
 pub use splat_data::{Camera, Capture, CaptureSettings, ImageSize, SceneScale, SplatData, View};
 pub use splat_model::optimizer::{SplatAdam, StateRecord};
-pub use splat_model::strategy::{Refinement, ScreenWants, StepContext, StepInfo, Strategy};
+pub use splat_model::strategy::{
+    Adc, AdcSettings, Mcmc, McmcSettings, Refinement, ScreenWants, StepContext, StepInfo, Strategy,
+};
 pub use splat_model::{
-    CameraTensors, Field, FieldStep, Gaussians, LearningRates, Moments, Optimized, RenderSettings,
-    RowEdit, SplatModel, losses, render,
+    CameraTensors, Field, FieldStep, Gaussians, InitSettings, LearningRates, Moments, Optimized,
+    RenderSettings, RowEdit, SplatModel, losses, project_gaussians, render, splats_from_points,
 };
 pub use splat_ops::{
-    OpError, ProjectSettings, Projected, RasterizeSettings, Rendered, project, rasterize, sh_colors,
+    AdamRows, OpError, ProjectSettings, Projected, RasterizeSettings, Rendered, project, rasterize,
+    sh_colors,
 };
 pub use splat_trainer::{
-    Hook, HookView, LossTerms, TargetView, TrainSettings, Trained, Trainer, evaluate,
+    Hook, HookView, LossTerms, StrategyKind, TargetView, TrainSettings, Trained, Trainer, evaluate,
 };
