@@ -56,6 +56,9 @@ def train(splat, folder, capture, arm, seed):
     subprocess.run([str(part) for part in command], check=True, stdout=subprocess.DEVNULL)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     found = json.loads((out / "metrics.json").read_text())
+    cap = adc["gaussians"] // divisor if divisor else None
+    if cap and found["gaussians"] > cap:
+        print(f"{capture.name}, {arm}: {found['gaussians']} Gaussians from the start are more than the {cap} that were meant")
     # Of the processor, which other work on the machine changes less than it does wall time.
     found["processor_seconds"] = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     (folder / f"{capture.name}-{arm}-{seed}.json").write_text(json.dumps(found))
@@ -87,8 +90,7 @@ def rows(found):
             if arm not in arms:
                 continue
             cells = [name, str(len(arms[arm]))]
-            keys = (("psnr", 2, 1), ("ssim", 4, 1), ("gaussians", 0, 1), ("processor_seconds", 0, 1))
-            for key, digits, _ in keys:
+            for key, digits in (("psnr", 2), ("ssim", 4), ("gaussians", 0), ("processor_seconds", 0)):
                 mean, error = summary([metrics[key] for metrics in arms[arm]])
                 cells.append(f"{mean:,.{digits}f}" + ("" if math.isnan(error) else f" ± {error:,.{digits}f}"))
             yield "| " + " | ".join(cells) + " |"
@@ -151,6 +153,11 @@ def report(folder, docs):
 
 
 if __name__ == "__main__":
-    what, *arguments = sys.argv[1:]
-    paths = [Path(argument) for argument in arguments]
-    {"run": lambda splat, folder, *captures: run(splat, folder, captures), "report": report}[what](*paths)
+    what, *paths = sys.argv[1:] or [""]
+    paths = [Path(path) for path in paths]
+    if what == "run" and len(paths) > 2:
+        run(paths[0], paths[1], paths[2:])
+    elif what == "report" and len(paths) == 2:
+        report(*paths)
+    else:
+        sys.exit(__doc__)

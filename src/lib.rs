@@ -39,6 +39,7 @@
 //! | [`ops::adam_step`] | one step of Adam on one parameter |
 //! | [`ops::exp`], [`ops::sigmoid`] | the activations of scales and opacities |
 //! | [`ops::ScreenStatistics`] | per-Gaussian sums for density control |
+//! | [`ops::Projected::with_absgrad`] | absolute screen gradients (AbsGS) |
 //! | [`ops::perturb_means`] | noise on the means, for MCMC |
 //!
 //! # Types
@@ -51,7 +52,7 @@
 //! | [`render`](model::render()) | the three ops composed |
 //! | [`Optimized`](model::Optimized) | a model with the optimisers of its fields |
 //! | [`RowEdit`](model::RowEdit) | an edit of the rows of a model, moments included |
-//! | [`Strategy`](model::strategy::Strategy) | the trait of density control |
+//! | [`Strategy`](model::strategy::Strategy) | the trait of density control; [`Adc`](model::strategy::Adc), [`Mcmc`](model::strategy::Mcmc) |
 //! | [`losses`](model::losses) | L1, MSE, PSNR and SSIM on tensors |
 //! | [`Capture`](data::Capture), [`Camera`](data::Camera) | photos with their cameras and points |
 //! | [`SplatData`](data::SplatData), [`scene`](data::scene) | a scene as plain arrays, and its files |

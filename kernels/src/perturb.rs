@@ -1,4 +1,4 @@
-//! Noise of the means, shaped like each Gaussian (Kheradmand et al. 2024, eq. 8 and 9):
+//! Noise of the means, shaped like each Gaussian (Kheradmand et al. 2024, section 3):
 //!
 //! ```text
 //! mean += gate(o) R diag(s²) Rᵀ eps,   gate(o) = amount / (1 + exp(steepness (o - opacity)))
@@ -17,8 +17,7 @@ use splat_core::Perturbation;
 use crate::launch::{Buffer, per_element};
 use crate::math::{Quat, Vec3, is_finite};
 
-/// Noise of this share of a Gaussian's size is not worth its draws.
-const NEGLIGIBLE: f32 = 1e-12;
+const NEGLIGIBLE: f32 = splat_core::noise::NEGLIGIBLE_NOISE as f32;
 
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
@@ -93,7 +92,7 @@ fn perturb_rows(
         if gate * largest > NEGLIGIBLE && quat.max_abs() > 0.0f32 {
             let axes = quat.normalize().to_matrix();
             let along = axes.transpose_mul_vec(draws(row as u32, noise));
-            let along = along.mul(scales).mul(scales).scale(gate);
+            let along = along.mul(scales).scale(gate).mul(scales);
             let offset = axes.mul_vec(along);
             if is_finite(offset.x) && is_finite(offset.y) && is_finite(offset.z) {
                 x += offset.x;

@@ -1,5 +1,8 @@
 //! Random numbers that are a function of where they are used, the same on every device.
 
+/// Noise of this share of a Gaussian's size is not worth its draws.
+pub const NEGLIGIBLE_NOISE: f64 = 1e-12;
+
 /// Four random words, a hash of four words (`pcg4d` of Jarzynski & Olano 2020, *Hash Functions for
 /// GPU Rendering*): multiplications and additions of 32 bits alone, which every device has.
 pub const fn pcg4d(words: [u32; 4]) -> [u32; 4] {

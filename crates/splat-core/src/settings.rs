@@ -241,10 +241,10 @@ pub enum AdamRows {
 }
 
 /// The noise of one step of Langevin dynamics (Kheradmand et al. 2024, *3D Gaussian Splatting as
-/// Markov Chain Monte Carlo*, eq. 8 and 9).
+/// Markov Chain Monte Carlo*, section 3).
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Perturbation {
-    /// Factor of the noise of a Gaussian that is quite transparent, in 1 / world units.
+    /// Factor of the noise where nothing fades it, in 1 / world units; positive.
     pub amount: f64,
     /// Opacity at which half of that is left.
     pub opacity: f64,

@@ -18,6 +18,7 @@
 //! | [`exp`], [`sigmoid`] | activations of scales and opacities | the input |
 //! | [`adam_step`] | one step of Adam on one parameter | - |
 //! | [`ScreenStatistics`] | sums for density control | - |
+//! | [`Projected::with_absgrad`] | absolute screen gradients, a second result of `rasterize`'s backward pass | - |
 //! | [`perturb_means`] | noise on the means, for MCMC | - |
 //!
 //! ```

@@ -11,7 +11,7 @@ use crate::settings::Perturbation;
 
 /// Moves every mean by noise that is shaped like its Gaussian and fades with its opacity:
 /// `mean += amount sigmoid(-steepness (opacity - o)) Sigma eps`, Sigma being the covariance
-/// (Kheradmand et al. 2024, *3D Gaussian Splatting as Markov Chain Monte Carlo*, eq. 8 and 9).
+/// (Kheradmand et al. 2024, *3D Gaussian Splatting as Markov Chain Monte Carlo*, section 3).
 ///
 /// # Arguments
 /// - `means` `[N, 3]`: world space.
@@ -22,7 +22,7 @@ use crate::settings::Perturbation;
 ///
 /// Not differentiable. One pass over memory, in place where nothing else holds the means. A
 /// Gaussian whose noise is below 1e-12 of its size, such as an opaque one, stays where it is, and
-/// so does one whose noise is not finite.
+/// so does one whose noise is not finite. Without a positive `amount` none moves.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};

@@ -86,7 +86,7 @@ impl Projected {
     /// (3DGS section 5.2). The leaf lies in the memory of the splats, and its gradient in that of
     /// theirs: nothing is copied.
     pub fn with_screen_probe(self) -> (Self, Tensor<3>) {
-        let probe = self.packed.clone().detach().require_grad();
+        let probe = tracked(self.packed.clone().detach());
         let packed =
             Dispatch::screen_probe(self.packed.into_dispatch(), probe.clone().into_dispatch());
         let probed = Self {
@@ -103,7 +103,8 @@ impl Projected {
     /// splat apart, their gradients cancel in that of the mean; here they add up.
     ///
     /// It costs two sums per pixel and splat in the backward pass; splats without the leaf pay
-    /// nothing. Rasterised several times, they have the sum of the sums.
+    /// nothing. Rasterised several times, they have the sum of the sums. A second call replaces the
+    /// leaf of the first.
     ///
     /// ```
     /// use burn::tensor::{Device, Tensor};
@@ -127,7 +128,7 @@ impl Projected {
     pub fn with_absgrad(self) -> (Self, Tensor<3>) {
         let [c, n, _] = self.packed.dims();
         let options = (&self.packed.device(), self.packed.dtype());
-        let leaf = Tensor::zeros([c, n, 2], options).require_grad();
+        let leaf = tracked(Tensor::zeros([c, n, 2], options));
         let probed = Self {
             absgrad: Some(leaf.clone()),
             ..self
@@ -142,6 +143,14 @@ impl Projected {
 
     fn columns(&self, start: usize, length: usize) -> Tensor<3> {
         self.packed.clone().narrow(2, start, length)
+    }
+}
+
+/// A leaf that gets a gradient, where the device has autodiff; elsewhere nothing does.
+fn tracked(leaf: Tensor<3>) -> Tensor<3> {
+    match leaf.device().is_autodiff() {
+        true => leaf.require_grad(),
+        false => leaf,
     }
 }
 

@@ -44,9 +44,9 @@ impl Plan {
         self.lanes
     }
 
-    /// Most channels of one launch. The values that a unit keeps for all of its pixels, 128 floats
-    /// at most, is to fit into its registers. Without planes it is 256: measured on a software
-    /// device, where memory is as near, 16 channels at once take a fifth less time than 8 and 8.
+    /// Most channels of one launch. A unit keeps their values for all of its pixels, at most 128
+    /// floats, in registers. Without planes it is 256: on a software device, where memory is as
+    /// near, 16 channels at once took a fifth less time than 8 and 8.
     pub fn channels(self) -> usize {
         let floats = if self.lanes == 1 { 256 } else { 128 };
         (floats / self.pixels()).min(MAX_CHANNELS)

@@ -7,6 +7,7 @@ use serde::{Deserialize, Serialize};
 use splat_ops::OpError;
 use tracing::trace_span;
 
+use super::relocation::relocate_logit;
 use super::screen_sums::ScreenSums;
 use super::{Refinement, ScreenWants, StepContext, StepInfo, Strategy, draw};
 use crate::optimizer::StateRecord;
@@ -23,7 +24,7 @@ pub struct AdcSettings {
     /// Rows may be added after this step, or after a quarter of the run where that is sooner:
     /// before, gradients are those of a scene that has not formed yet. Default 500.
     pub start: usize,
-    /// Milestone: no rows are added or removed after this step. Default 15,000.
+    /// Milestone: no rows are added or removed from this step on. Default 15,000.
     pub stop: usize,
     /// Interval: steps between refinements. Default 100.
     pub every: usize,
@@ -229,9 +230,10 @@ impl Adc {
                 edit.offset(new, "means", &splats.sample(*row, draw(*row, half)));
                 edit.offset(new, "log_scales", &[smaller; 3]);
                 if self.settings.revised_opacity {
-                    let logit = draw::logit(revised(splats.opacity(*row)));
-                    let change = logit - splats.opacity_logits[*row];
-                    // An infinite logit is an opacity of 0 or 1, and so is that of the halves.
+                    let old = splats.opacity_logits[*row];
+                    // By logits, of which an opacity next to one keeps no digit.
+                    let change = relocate_logit(old, 2, &(0.0..=1.0)).0 - old;
+                    // An infinite logit is an opacity of 0 or 1, and so are those of the halves.
                     if change.is_finite() {
                         edit.offset(new, "opacity_logits", &[change]);
                     }
@@ -324,12 +326,12 @@ impl<M: SplatModel> Strategy<M> for Adc {
         let StepInfo { step, run } = context.at;
         let settings = &self.settings;
         let stop = run.milestone(settings.stop);
-        if step > stop {
+        if step >= stop {
             self.sums.clear();
             return Ok(None);
         }
         let (resets, reset_opacity) = (
-            step.is_multiple_of(settings.reset_every) && step < stop,
+            step.is_multiple_of(settings.reset_every),
             settings.reset_opacity,
         );
         let start = settings.start.min(run.steps / 4);

@@ -21,7 +21,7 @@ pub struct McmcSettings {
     /// Gaussians are moved and added after this step, or after a quarter of the run where that is
     /// sooner. Default 500.
     pub start: usize,
-    /// Milestone: none is moved or added after this step. Default 25,000.
+    /// Milestone: none is moved or added from this step on. Default 25,000.
     pub stop: usize,
     /// Interval: steps between two times that Gaussians are moved and added. Default 100.
     pub every: usize,
@@ -273,6 +273,10 @@ impl Mcmc {
         let dead = self.dead(&rows);
         let mut living = rows.opacities();
         dead.iter().for_each(|row| living[*row] = 0.0);
+        if dead.len() == rows.len() {
+            // Copies of the dead would be dead.
+            return (rows.finish(), Refinement::default());
+        }
         let relocated = sample(at, &living, dead.iter().map(|row| *row as u64));
         rows.relocate(&dead, &relocated, self.settings.min_opacity);
         let ids = (0..self.room(rows.len()) as u64).map(|id| ADDED + id);
@@ -391,23 +395,22 @@ impl McmcSettings {
                 self.init_opacity, self.min_opacity
             ));
         }
+        // Beyond these, noise leaves nothing where it was, and the terms drown the photos.
         let sizes = [
-            ("noise", self.noise),
-            ("noise_steepness", self.noise_steepness),
-            ("opacity_weight", self.opacity_weight),
-            ("scale_weight", self.scale_weight),
+            ("noise", self.noise, 1e8),
+            ("noise_steepness", self.noise_steepness, 1e6),
+            ("opacity_weight", self.opacity_weight, 1.0),
+            ("scale_weight", self.scale_weight, 1.0),
         ];
-        let usable = |value: f64| value.is_finite() && value >= 0.0;
-        if let Some((name, value)) = sizes.iter().find(|(_, value)| !usable(*value)) {
-            return Err(format!(
-                "`{name}` must be at least 0 and finite, it is {value}"
-            ));
+        let fits = |value: f64, most: f64| (0.0..=most).contains(&value);
+        if let Some((name, value, most)) =
+            sizes.iter().find(|(_, value, most)| !fits(*value, *most))
+        {
+            return Err(format!("`{name}` must lie in [0, {most}], it is {value}"));
         }
-        if !(self.init_scale.is_finite() && self.init_scale > 0.0) {
+        if !(0.0 < self.init_scale && self.init_scale <= 100.0) {
             let scale = self.init_scale;
-            return Err(format!(
-                "`init_scale` must be positive and finite, it is {scale}"
-            ));
+            return Err(format!("`init_scale` must lie in (0, 100], it is {scale}"));
         }
         Ok(())
     }
@@ -478,7 +481,7 @@ mod tests {
     #[test]
     fn a_model_whose_every_gaussian_is_dead_stays_as_it_is() {
         let opacities = logits(&[1e-3; 4]);
-        let settings = McmcSettings::new().with_max_gaussians(4);
+        let settings = McmcSettings::new().with_growth(2.0);
         let (_, report) = Mcmc::new(settings).plan(&at(600), &opacities, &[[0.0; 3]; 4]);
         assert_eq!(report, Refinement::default());
     }
@@ -505,7 +508,11 @@ mod tests {
             ("growth", McmcSettings::new().with_growth(f64::NAN)),
             ("min_opacity", McmcSettings::new().with_min_opacity(1.0)),
             ("init_opacity", McmcSettings::new().with_init_opacity(0.001)),
-            ("noise", McmcSettings::new().with_noise(f64::INFINITY)),
+            ("noise", McmcSettings::new().with_noise(1e300)),
+            (
+                "opacity_weight",
+                McmcSettings::new().with_opacity_weight(1e4),
+            ),
             ("scale_weight", McmcSettings::new().with_scale_weight(-1.0)),
             ("init_scale", McmcSettings::new().with_init_scale(0.0)),
         ] {

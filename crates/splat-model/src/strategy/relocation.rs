@@ -1,5 +1,5 @@
 //! Splitting a Gaussian into copies that together look like it (Kheradmand et al. 2024, *3D
-//! Gaussian Splatting as Markov Chain Monte Carlo*, section 3.3 and eq. 9).
+//! Gaussian Splatting as Markov Chain Monte Carlo*, section 3).
 
 use core::f64::consts::PI;
 use core::ops::RangeInclusive;

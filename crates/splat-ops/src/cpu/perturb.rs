@@ -5,7 +5,7 @@ use core::marker::PhantomData;
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
-use splat_core::noise::{normals, pcg4d};
+use splat_core::noise::{NEGLIGIBLE_NOISE, normals, pcg4d};
 
 use super::buffer::{Buffer, BufferMut};
 use super::math::{apply, apply_transposed, normalize_quat, rotation};
@@ -65,7 +65,7 @@ fn displacement(
     let gate = noise.gate(opacity);
     let scales = log_scales.map(f64::exp);
     let largest = scales.into_iter().fold(0.0, f64::max);
-    if !(gate * largest > NEGLIGIBLE) {
+    if !(gate * largest > NEGLIGIBLE_NOISE) {
         return None;
     }
     let (unit, _, has_length) = normalize_quat(quat);
@@ -75,6 +75,3 @@ fn displacement(
     let offset = apply(&axes, along);
     has_length.then_some(offset)
 }
-
-/// Noise of this share of a Gaussian's size is not worth its draws.
-const NEGLIGIBLE: f64 = 1e-12;

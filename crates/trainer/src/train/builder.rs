@@ -238,10 +238,15 @@ impl<M: SplatModel> TrainerBuilder<M> {
         let init = strategy.first_gaussians(&config.init);
         let with_init = TrainSettings {
             init: init.clone(),
+            // The strategy has had its say.
+            strategy: StrategyKind::Adc,
             ..record.config.clone()
         };
         let wrong = |reason: String| {
-            TrainError::Setup(format!("the strategy {}: {reason}", strategy.name()))
+            // Names may go on with all settings.
+            let name = strategy.name();
+            let name = name.split(" with ").next().unwrap_or(&name);
+            TrainError::Setup(format!("the strategy {name}: {reason}"))
         };
         with_init.validate().map_err(wrong)?;
         let splats = first_gaussians(&self.capture, &init, schedule.scene_scale, origin)?;

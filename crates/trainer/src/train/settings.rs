@@ -132,7 +132,13 @@ impl TrainSettings {
                 bytes.len()
             ));
         }
-        toml::from_str(utf8(bytes)?).map_err(|error| one_line(&error.to_string()))
+        toml::from_str(utf8(bytes)?).map_err(|error| {
+            let mut message = one_line(&error.to_string());
+            if message.contains("unknown variant `absgrad`") {
+                message += "; AbsGrad is `strategy = \"adc\"` with `absgrad = true` in `[density]`";
+            }
+            message
+        })
     }
 
     /// The limit of growth of the strategy.
@@ -206,6 +212,15 @@ impl TrainSettings {
         self.check_counts()?;
         self.check_rates_and_shares()?;
         self.check_reachable_opacities()?;
+        let (init, usual) = (&self.init, InitSettings::default());
+        if self.strategy == StrategyKind::Mcmc
+            && (init.opacity != usual.opacity || init.scale != usual.scale)
+        {
+            return Err(
+                "`init.opacity` and `init.scale` have no effect with the strategy mcmc; set `mcmc.init_opacity` and `mcmc.init_scale`"
+                    .to_owned(),
+            );
+        }
         (self.mcmc.validate()).map_err(|problem| problem.replacen('`', "`mcmc.", 1))?;
         if let Some(color) = self.background
             && !color.iter().all(|channel| channel.is_finite())
@@ -232,6 +247,13 @@ impl TrainSettings {
             ("density.reset_every", self.density.reset_every),
         ];
         if let Some((field, _)) = counts.iter().find(|(_, value)| *value == 0) {
+            return Err(format!("`{field}` must be at least 1"));
+        }
+        let limits = [
+            ("density.max_gaussians", self.density.max_gaussians),
+            ("mcmc.max_gaussians", self.mcmc.max_gaussians),
+        ];
+        if let Some((field, _)) = limits.iter().find(|(_, most)| *most == Some(0)) {
             return Err(format!("`{field}` must be at least 1"));
         }
         if self.steps as u64 > MOST_STEPS {
@@ -420,6 +442,15 @@ mod tests {
         assert!(found.contains("`density.prune_scale`"), "{found}");
         let found = problem(&|config| config.density.reset_opacity = 0.0);
         assert!(found.contains("`density.reset_opacity`"), "{found}");
+        let found = problem(&|config| config.density.max_gaussians = Some(0));
+        assert!(found.contains("`density.max_gaussians`"), "{found}");
+        let found = problem(&|config| {
+            config.strategy = StrategyKind::Mcmc;
+            config.init.opacity = 0.3;
+        });
+        assert!(found.contains("`mcmc.init_opacity`"), "{found}");
+        let message = TrainSettings::parse(b"strategy = \"absgrad\"").unwrap_err();
+        assert!(message.contains("`[density]`"), "{message}");
         let found = problem(&|config| config.mcmc.init_opacity = 0.001);
         assert!(found.contains("`mcmc.init_opacity`"), "{found}");
         let found = problem(&|config| config.mcmc.growth = 0.5);
