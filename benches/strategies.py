@@ -1,19 +1,20 @@
 #!/usr/bin/env python3
 """Compare the strategies on captures, and write docs/STRATEGIES.md with its picture.
 
-    python3 benches/strategies.py run SPLAT FOLDER CAPTURE...   # trains what is missing in FOLDER; hours
-    python3 benches/strategies.py report FOLDER docs            # writes STRATEGIES.md and strategies.svg
+    python3 benches/strategies.py run SPLAT CAPTURE...   # trains what docs/strategies.csv has not yet; hours
+    python3 benches/strategies.py report                 # writes docs/STRATEGIES.md and docs/strategies.svg
 
-SPLAT is the program (target/release/splat). Every run keeps its metrics.json in FOLDER, so that an interrupted
+SPLAT is the program (target/release/splat). Every run adds a line to docs/strategies.csv, so that an interrupted
 comparison goes on. Runs are half size, 7,000 steps, on the CPU, with the seeds 0, 1 and 2.
 """
 
+import csv
 import json
 import math
 import resource
-import shutil
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 STEPS = 7000
@@ -28,41 +29,59 @@ ARMS = {
 }
 
 
-def metrics(folder, capture, arm, seed):
-    path = folder / f"{capture}-{arm}-{seed}.json"
-    return json.loads(path.read_text()) if path.exists() else None
+DOCS = Path(__file__).parents[1] / "docs"
+FIGURES = ("psnr", "ssim", "gaussians", "processor_seconds")
 
 
-def run(splat, folder, captures):
-    folder.mkdir(parents=True, exist_ok=True)
+def gather():
+    """The figures of all runs so far, by capture, arm and seed."""
+    path = DOCS / "strategies.csv"
+    if not path.exists():
+        return {}
+    with path.open() as file:
+        runs = list(csv.DictReader(file))
+    return {(run["capture"], run["arm"], int(run["seed"])): {key: float(run[key]) for key in FIGURES} for run in runs}
+
+
+def keep(capture, arm, seed, figures):
+    path = DOCS / "strategies.csv"
+    begins = not path.exists()
+    with path.open("a") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        if begins:
+            writer.writerow(["capture", "arm", "seed", *FIGURES])
+        writer.writerow([capture, arm, seed, *(f"{figures[key]:.6g}" for key in FIGURES)])
+
+
+def run(splat, captures):
     for seed in SEEDS:
         for capture in captures:
             for arm in ARMS:
-                if metrics(folder, capture.name, arm, seed) is None:
-                    train(splat, folder, capture, arm, seed)
+                if (capture.name, arm, seed) not in gather():
+                    train(splat, capture, arm, seed)
 
 
-def train(splat, folder, capture, arm, seed):
+def train(splat, capture, arm, seed):
     _, text, divisor = ARMS[arm]
-    out, config = folder / "run", folder / "run.toml"
-    config.write_text(text)
-    command = [splat, "--device", "cpu", "--seed", str(seed), "--quiet", "train", capture, "--downscale", "2"]
-    command += ["--steps", str(STEPS), "--config", config, "--out", out]
-    if divisor:
-        adc = metrics(folder, capture.name, "adc", seed)
-        command += ["--max-gaussians", str(adc["gaussians"] // divisor)]
-    shutil.rmtree(out, ignore_errors=True)
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    subprocess.run([str(part) for part in command], check=True, stdout=subprocess.DEVNULL)
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    found = json.loads((out / "metrics.json").read_text())
-    cap = adc["gaussians"] // divisor if divisor else None
-    if cap and found["gaussians"] > cap:
-        print(f"{capture.name}, {arm}: {found['gaussians']} Gaussians from the start are more than the {cap} that were meant")
+    with tempfile.TemporaryDirectory() as folder:
+        out, config = Path(folder) / "run", Path(folder) / "run.toml"
+        config.write_text(text)
+        command = [splat, "--device", "cpu", "--seed", seed, "--quiet", "train", capture, "--downscale", 2]
+        command += ["--steps", STEPS, "--config", config, "--out", out]
+        cap = None
+        if divisor:
+            cap = int(gather()[capture.name, "adc", seed]["gaussians"]) // divisor
+            command += ["--max-gaussians", cap]
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([str(part) for part in command], check=True, stdout=subprocess.DEVNULL)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        figures = json.loads((out / "metrics.json").read_text())
     # Of the processor, which other work on the machine changes less than it does wall time.
-    found["processor_seconds"] = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    (folder / f"{capture.name}-{arm}-{seed}.json").write_text(json.dumps(found))
-    print(f"{capture.name:12} {arm:9} seed {seed}: {found['psnr']:.2f} dB, {found['gaussians']} Gaussians", flush=True)
+    figures["processor_seconds"] = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    keep(capture.name, arm, seed, figures)
+    print(f"{capture.name:12} {arm:9} seed {seed}: {figures['psnr']:.2f} dB, {figures['gaussians']} Gaussians", flush=True)
+    if cap and figures["gaussians"] > cap:
+        print(f"  the capture has more points than the {cap} Gaussians that were meant")
 
 
 def summary(values):
@@ -74,12 +93,11 @@ def summary(values):
     return mean, math.sqrt(variance / len(values))
 
 
-def gather(folder):
-    """For each capture and arm, the metrics of all seeds that are there."""
+def by_capture():
+    """For each capture and arm, the figures of all seeds that are there."""
     found = {}
-    for path in sorted(folder.glob("*-*-*.json")):
-        capture, arm, _ = path.stem.rsplit("-", 2)
-        found.setdefault(capture, {}).setdefault(arm, []).append(json.loads(path.read_text()))
+    for (capture, arm, _), figures in gather().items():
+        found.setdefault(capture, {}).setdefault(arm, []).append(figures)
     return found
 
 
@@ -91,7 +109,7 @@ def rows(found):
                 continue
             cells = [name, str(len(arms[arm]))]
             for key, digits in (("psnr", 2), ("ssim", 4), ("gaussians", 0), ("processor_seconds", 0)):
-                mean, error = summary([metrics[key] for metrics in arms[arm]])
+                mean, error = summary([figures[key] for figures in arms[arm]])
                 cells.append(f"{mean:,.{digits}f}" + ("" if math.isnan(error) else f" ± {error:,.{digits}f}"))
             yield "| " + " | ".join(cells) + " |"
 
@@ -141,23 +159,22 @@ def axis(values, least=None):
     return first * step, last * step, [round(tick * step, 6) for tick in range(first, last + 1)]
 
 
-def report(folder, docs):
+def report():
     """Replaces what is between the markers of STRATEGIES.md, and writes the picture."""
-    found = gather(folder)
-    page = docs / "STRATEGIES.md"
+    found = by_capture()
+    page = DOCS / "STRATEGIES.md"
     before, rest = page.read_text().split("<!-- runs -->\n")
     _, after = rest.split("<!-- end of runs -->\n")
     table = "\n".join(rows(found)).strip()
     page.write_text(f"{before}<!-- runs -->\n{table}\n<!-- end of runs -->\n{after}")
-    (docs / "strategies.svg").write_text(picture(found))
+    (DOCS / "strategies.svg").write_text(picture(found))
 
 
 if __name__ == "__main__":
     what, *paths = sys.argv[1:] or [""]
-    paths = [Path(path) for path in paths]
-    if what == "run" and len(paths) > 2:
-        run(paths[0], paths[1], paths[2:])
-    elif what == "report" and len(paths) == 2:
-        report(*paths)
+    if what == "run" and len(paths) > 1:
+        run(Path(paths[0]), [Path(path) for path in paths[1:]])
+    elif what == "report" and not paths:
+        report()
     else:
         sys.exit(__doc__)
