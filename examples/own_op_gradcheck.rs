@@ -4,8 +4,9 @@
 //! The picture, right and wrong: relative errors of the gradient of every opacity, from 1e-16
 //! (dark) to 1 (bright). A row is a ray, from the eye on the left. The last sample of a ray hides
 //! nothing, so that its gradient is right in both. `burn_splat::lab` is the feature `lab`, which
-//! the examples of this repository have. Run it: `cargo run --release --example own_op_gradcheck
-//! [SIZE [FOLDER]]`
+//! the examples of this repository have.
+//!
+//! Run it: `cargo run --release --example own_op_gradcheck [SIZE [FOLDER]]`
 
 mod common;
 

@@ -74,7 +74,8 @@ fn every_example_is_short_tested_and_in_the_readme() {
         let name = file.file_stem().unwrap().to_string_lossy().into_owned();
         let text = std::fs::read_to_string(&file).unwrap();
         assert!(text.lines().count() < 80, "{name} has 80 lines or more");
-        assert!(text.contains(&format!("`cargo run --release --example {name} ")));
+        let command = format!("`cargo run --release --example {name} ");
+        assert!(text.contains(&command), "{name} does not say {command}");
         assert!(
             readme.contains(&format!("(examples/{name}.rs)")),
             "README: {name}"
