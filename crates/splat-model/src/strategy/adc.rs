@@ -24,7 +24,7 @@ pub struct AdcSettings {
     /// Rows may be added after this step, or after a quarter of the run where that is sooner:
     /// before, gradients are those of a scene that has not formed yet. Default 500.
     pub start: usize,
-    /// Milestone: no rows are added or removed from this step on. Default 15,000.
+    /// Milestone: no rows are added or removed after this step. Default 15,000.
     pub stop: usize,
     /// Interval: steps between refinements. Default 100.
     pub every: usize,
@@ -326,12 +326,12 @@ impl<M: SplatModel> Strategy<M> for Adc {
         let StepInfo { step, run } = context.at;
         let settings = &self.settings;
         let stop = run.milestone(settings.stop);
-        if step >= stop {
+        if step > stop {
             self.sums.clear();
             return Ok(None);
         }
         let (resets, reset_opacity) = (
-            step.is_multiple_of(settings.reset_every),
+            step.is_multiple_of(settings.reset_every) && step < stop,
             settings.reset_opacity,
         );
         let start = settings.start.min(run.steps / 4);
