@@ -99,12 +99,13 @@ impl Strategy {
         if let (None, Some(most)) = (config.max_gaussians(), most) {
             config.set_max_gaussians(most);
         }
-        let density = &mut config.density;
-        let absgrad = self == Self::Absgrad;
-        let changed = self != Self::Mcmc && density.absgrad != absgrad;
+        let (density, absgrad) = (&mut config.density, self == Self::Absgrad);
+        if self == Self::Mcmc || density.absgrad == absgrad {
+            return None;
+        }
         density.absgrad = absgrad;
         // A threshold of signed gradients is none of absolute ones, which are larger.
-        (changed && density.grow_gradient.take().is_some()).then_some(
+        (density.grow_gradient.take().is_some()).then_some(
             "`density.grow_gradient` of the settings is for the other kind of gradients; its default is taken",
         )
     }

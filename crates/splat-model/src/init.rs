@@ -11,6 +11,8 @@ use splat_core::{SH_C0, sh_coefficient_count};
 use splat_data::SceneScale;
 use splat_data::SplatData;
 
+use crate::opacity::logit;
+
 /// 8-bit level at which a channel starts that is 0 in the photos.
 const DARKEST_LEVEL: f64 = 0.5;
 
@@ -100,7 +102,7 @@ pub fn splats_from_points(
         means: positions.to_vec(),
         log_scales,
         quats: vec![[1.0, 0.0, 0.0, 0.0]; n],
-        opacity_logits: vec![(opacity / (1.0 - opacity)).ln() as f32; n],
+        opacity_logits: vec![logit(opacity) as f32; n],
         sh0: colors.iter().map(sh0).collect(),
         sh_rest: vec![0.0; n * (sh_coefficient_count(settings.sh_degree) - 1) * 3],
         sh_degree: settings.sh_degree,

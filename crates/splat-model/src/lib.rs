@@ -8,6 +8,7 @@ mod init;
 pub mod losses;
 mod model;
 mod morton;
+mod opacity;
 mod optimized;
 pub mod optimizer;
 mod rates;

@@ -91,13 +91,17 @@ impl<M: Module> Optimized<M> {
         if edit.row_set() == GAUSSIANS && edit.is_empty() {
             return wrong("no Gaussian would be left, and nothing could grow back".to_owned());
         }
+        let sources = [
+            ("is made from", edit.sources()),
+            ("has the moments of", edit.moment_sources()),
+        ];
         for field in self.fields.iter().filter(in_set) {
             let [rows, _] = shapes[&field.name];
             let beyond = |source: &u32| *source as usize >= rows;
-            for sources in [edit.sources(), edit.moment_sources()] {
+            for (what, sources) in &sources {
                 if let Some(index) = sources.iter().position(beyond) {
                     return wrong(format!(
-                        "new row {index} is made from row {} of `{}`, which has {rows}",
+                        "new row {index} {what} row {} of `{}`, which has {rows}",
                         sources[index], field.name
                     ));
                 }

@@ -14,6 +14,7 @@ use splat_data::SceneScale;
 use splat_ops::{AdamRows, OpError};
 
 use crate::field::Field;
+use crate::opacity::logit;
 use crate::optimizer::{FieldOptimizer, MomentEdit, SplatAdam};
 use crate::{LearningRates, SplatModel};
 use fields::{FieldVisitor, GradientsOf, Paths, Untracked, ValuesOf, change};
@@ -390,7 +391,7 @@ impl<M: Module> Optimized<M> {
     /// # Errors
     /// When the model has no opacity logits.
     pub fn clamp_opacities(&mut self, opacity: f64) -> Result<(), OpError> {
-        let logit = (opacity / (1.0 - opacity)).ln();
+        let logit = logit(opacity);
         self.update("opacity_logits", |logits| logits.clamp_max(logit))?;
         self.restart_moments("opacity_logits");
         Ok(())

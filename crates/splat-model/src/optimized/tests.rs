@@ -272,6 +272,8 @@ fn changes_of_another_width_are_named_by_row() {
     };
     assert!(refused(&mut optimized, &sets).contains("new row 1 changes 3 values"));
     assert!(refused(&mut optimized, &|edit| edit.retain(|_| false)).contains("no Gaussian"));
+    let moments = |edit: &mut RowEdit| edit.set_moments(1, Moments::Of(9));
+    assert!(refused(&mut optimized, &moments).contains("new row 1 has the moments of row 9"));
     let mut nowhere = RowEdit::of_row_set(7);
     nowhere.push(0, Moments::Keep);
     let message = optimized.edit_rows(&nowhere).unwrap_err().to_string();

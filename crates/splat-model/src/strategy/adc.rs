@@ -9,7 +9,8 @@ use tracing::trace_span;
 
 use super::relocation::relocate_logit;
 use super::screen_sums::ScreenSums;
-use super::{Refinement, ScreenWants, StepContext, StepInfo, Strategy, draw};
+use super::{Refinement, ScreenWants, StepContext, StepInfo, Strategy, check_fields, draw};
+use crate::opacity::sigmoid;
 use crate::optimizer::StateRecord;
 use crate::rows::{Moments, RowEdit};
 use crate::{Field, Optimized, SplatModel};
@@ -119,7 +120,7 @@ impl Splats {
     }
 
     fn opacity(&self, row: usize) -> f64 {
-        draw::sigmoid(self.opacity_logits[row])
+        sigmoid(self.opacity_logits[row])
     }
 
     /// A standard normal draw, as an offset from the mean of the Gaussian that it is a draw from.
@@ -276,11 +277,7 @@ impl<M: SplatModel> Strategy<M> for Adc {
     }
 
     fn check(&self, fields: &[Field]) -> Result<(), String> {
-        let needed = ["means", "log_scales", "quats", "opacity_logits"];
-        let has = |name: &&str| fields.iter().any(|field| field.name == **name);
-        if let Some(name) = needed.iter().find(|name| !has(name)) {
-            return Err(format!("adaptive density control needs a field `{name}`"));
-        }
+        check_fields("adaptive density control", fields)?;
         let AdcSettings {
             every,
             reset_every,
@@ -334,7 +331,7 @@ impl<M: SplatModel> Strategy<M> for Adc {
             step.is_multiple_of(settings.reset_every) && step < stop,
             settings.reset_opacity,
         );
-        let start = settings.start.min(run.steps / 4);
+        let start = run.start(settings.start);
         let due = step > start && step.is_multiple_of(settings.every);
         let mut report = None;
         if due && let Some(gradients) = self.sums.take_means()? {
@@ -461,7 +458,7 @@ mod tests {
         let (plan, _) = Adc::new(settings).plan(&at(600), &splats(), &GRADIENTS);
         for half in [3, 4] {
             let logit = plan.offset_of(half, "opacity_logits").unwrap()[0];
-            let opacity = draw::sigmoid(logit);
+            let opacity = sigmoid(logit);
             assert!((1.0 - (1.0 - opacity).powi(2) - 0.5).abs() < 1e-12);
         }
         // A clone is an exact copy.

@@ -22,11 +22,3 @@ pub(super) fn normals(at: &StepInfo, id: u64) -> [f64; 3] {
 pub(super) fn uniform(at: &StepInfo, id: u64) -> f64 {
     generator(at, id).random()
 }
-
-pub(super) fn sigmoid(logit: f64) -> f64 {
-    1.0 / (1.0 + (-logit).exp())
-}
-
-pub(super) fn logit(opacity: f64) -> f64 {
-    opacity.ln() - (-opacity).ln_1p()
-}

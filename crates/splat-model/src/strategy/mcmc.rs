@@ -7,7 +7,8 @@ use serde::{Deserialize, Serialize};
 use splat_ops::{OpError, Perturbation, perturb_means};
 
 use super::relocation::relocate_logit;
-use super::{Pass, Refinement, StepContext, StepInfo, Strategy, draw};
+use super::{Pass, Refinement, StepContext, StepInfo, Strategy, check_fields, draw};
+use crate::opacity::sigmoid;
 use crate::rows::{Moments, RowEdit};
 use crate::{Field, InitSettings, Optimized, SplatModel};
 
@@ -175,10 +176,7 @@ impl Rows {
     }
 
     fn opacities(&self) -> Vec<f64> {
-        self.logits
-            .iter()
-            .map(|logit| draw::sigmoid(*logit))
-            .collect()
+        self.logits.iter().map(|logit| sigmoid(*logit)).collect()
     }
 
     /// Gives each row that was chosen the opacity and the scales of the copies that it now is one
@@ -271,12 +269,12 @@ impl Mcmc {
     ) -> (RowEdit, Refinement) {
         let mut rows = Rows::new(opacity_logits, log_scales);
         let dead = self.dead(&rows);
-        let mut living = rows.opacities();
-        dead.iter().for_each(|row| living[*row] = 0.0);
         if dead.len() == rows.len() {
             // Copies of the dead would be dead.
             return (rows.finish(), Refinement::default());
         }
+        let mut living = rows.opacities();
+        dead.iter().for_each(|row| living[*row] = 0.0);
         let relocated = sample(at, &living, dead.iter().map(|row| *row as u64));
         rows.relocate(&dead, &relocated, self.settings.min_opacity);
         let ids = (0..self.room(rows.len()) as u64).map(|id| ADDED + id);
@@ -316,11 +314,7 @@ impl<M: SplatModel> Strategy<M> for Mcmc {
     }
 
     fn check(&self, fields: &[Field]) -> Result<(), String> {
-        let needed = ["means", "log_scales", "quats", "opacity_logits"];
-        let has = |name: &&str| fields.iter().any(|field| field.name == **name);
-        if let Some(name) = needed.iter().find(|name| !has(name)) {
-            return Err(format!("MCMC needs a field `{name}`"));
-        }
+        check_fields("MCMC", fields)?;
         self.settings.validate()
     }
 
@@ -347,7 +341,7 @@ impl<M: SplatModel> Strategy<M> for Mcmc {
     fn after_step(&mut self, context: &mut StepContext<M>) -> Result<Option<Refinement>, OpError> {
         let StepInfo { step, run } = context.at;
         let settings = &self.settings;
-        let start = settings.start.min(run.steps / 4);
+        let start = run.start(settings.start);
         let stop = run.milestone(settings.stop);
         let mut report = None;
         if start < step && step < stop && step.is_multiple_of(settings.every) {
@@ -419,6 +413,7 @@ impl McmcSettings {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::opacity::logit;
 
     fn at(step: usize) -> StepInfo {
         let run = super::super::RunSchedule {
@@ -430,8 +425,7 @@ mod tests {
     }
 
     fn logits(opacities: &[f64]) -> Vec<f64> {
-        let logit = |opacity: &f64| draw::logit(*opacity);
-        opacities.iter().map(logit).collect()
+        opacities.iter().map(|opacity| logit(*opacity)).collect()
     }
 
     #[test]
@@ -448,7 +442,7 @@ mod tests {
         assert_eq!(set.set_rows, [0, 1, 2]);
         // Three in one place look like the one that was there.
         for logit in &set.set_values {
-            let opacity = draw::sigmoid(*logit);
+            let opacity = sigmoid(*logit);
             assert!((1.0 - (1.0 - opacity).powi(3) - 0.5).abs() < 1e-12);
         }
     }

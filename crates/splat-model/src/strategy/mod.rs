@@ -253,3 +253,14 @@ pub trait Strategy<M: SplatModel>: Send {
         Ok(())
     }
 }
+
+/// Checks that a model has the fields that the strategies of this crate edit, for a strategy of
+/// this name.
+fn check_fields(strategy: &str, fields: &[Field]) -> Result<(), String> {
+    let needed = ["means", "log_scales", "quats", "opacity_logits"];
+    let has = |name: &&str| fields.iter().any(|field| field.name == **name);
+    match needed.iter().find(|name| !has(name)) {
+        Some(name) => Err(format!("{strategy} needs a field `{name}`")),
+        None => Ok(()),
+    }
+}

@@ -4,7 +4,7 @@
 use core::f64::consts::PI;
 use core::ops::RangeInclusive;
 
-use super::draw;
+use crate::opacity::{logit, sigmoid};
 
 /// Opacity of each of `copies` Gaussians in one place that replace one of `opacity`, and the factor
 /// of their scales.
@@ -43,11 +43,11 @@ pub(super) fn relocate_logit(
     let each = shade / copies.max(1) as f64;
     let shared = -each.exp_m1();
     let (shared, logit_of_each) = match shared {
-        low if low < *bounds.start() => (*bounds.start(), draw::logit(*bounds.start())),
-        high if high > *bounds.end() => (*bounds.end(), draw::logit(*bounds.end())),
+        low if low < *bounds.start() => (*bounds.start(), self::logit(*bounds.start())),
+        high if high > *bounds.end() => (*bounds.end(), self::logit(*bounds.end())),
         shared => (shared, shared.ln() - each),
     };
-    let factor = scale_factor(draw::sigmoid(logit), shared, copies);
+    let factor = scale_factor(sigmoid(logit), shared, copies);
     (logit_of_each, factor)
 }
 

@@ -31,6 +31,12 @@ impl RunSchedule {
         let share = (self.steps as f64 / REFERENCE_STEPS).min(1.0);
         ((step as f64 * share).round() as usize).max(1)
     }
+
+    /// The step after which Gaussians may be added: this one, or a quarter of the run where that is
+    /// sooner.
+    pub(super) fn start(&self, step: usize) -> usize {
+        step.min(self.steps / 4)
+    }
 }
 
 #[cfg(test)]
