@@ -52,6 +52,7 @@ fn cameras(device: &Device) -> burn_splat::model::CameraTensors {
     let camera = Camera {
         viewmat: glam::DMat4::IDENTITY,
         intrinsics: [40.0, 40.0, 18.0, 14.0],
+        lens: burn_splat::data::Lens::Pinhole,
         size: SIZE,
     };
     CameraTensors::from_camera(&camera, device)

@@ -2,6 +2,7 @@
 //! measure of available memory. No dependencies.
 
 pub mod exp;
+mod lens;
 pub mod memory;
 pub mod noise;
 mod packed;
@@ -9,6 +10,7 @@ mod settings;
 mod sh;
 mod tensors;
 
+pub use lens::{CameraModel, Lens, LensDomain};
 pub use packed::{PROJECTED_DEPTH, PROJECTED_EXTENT, PROJECTED_WIDTH, SPLAT_SIZE_MAX, TILE_SIDE};
 pub use settings::{
     ALPHA_MIN, Activation, AdamRows, AdamStep, ClampGradient, ImageSize, Perturbation,

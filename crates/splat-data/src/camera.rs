@@ -1,17 +1,18 @@
-//! Pinhole cameras.
+//! Cameras.
 
 use glam::{DMat4, DVec3};
-use splat_core::ImageSize;
+use splat_core::{ImageSize, Lens};
 
-/// A pinhole camera: axes +x right, +y down, +z forward (OpenCV, COLMAP).
+/// A camera: axes +x right, +y down, +z forward (OpenCV, COLMAP).
 ///
 /// ```
 /// use glam::{DMat4, DVec3};
-/// use splat_data::{Camera, ImageSize};
+/// use splat_data::{Camera, ImageSize, Lens};
 ///
 /// let camera = Camera {
 ///     viewmat: DMat4::from_translation(DVec3::new(0.0, 0.0, 2.0)),
 ///     intrinsics: [50.0, 50.0, 32.0, 24.0],
+///     lens: Lens::Pinhole,
 ///     size: ImageSize { width: 64, height: 48 },
 /// };
 /// assert_eq!(camera.position(), DVec3::new(0.0, 0.0, -2.0));
@@ -22,6 +23,8 @@ pub struct Camera {
     pub viewmat: DMat4,
     /// fx, fy, cx, cy in pixels; the centre of the first pixel is at (0.5, 0.5).
     pub intrinsics: [f64; 4],
+    /// Camera model and distortion.
+    pub lens: Lens,
     /// Image size in pixels.
     pub size: ImageSize,
 }
@@ -55,6 +58,7 @@ mod tests {
         let camera = Camera {
             viewmat,
             intrinsics: [500.0, 500.0, 50.0, 50.0],
+            lens: Lens::Pinhole,
             size: ImageSize {
                 width: 100,
                 height: 100,

@@ -19,4 +19,4 @@ pub use replace::{
 };
 pub use scene::{SceneFileError, SceneSettings, SplatData};
 pub use scene_scale::SceneScale;
-pub use splat_core::ImageSize;
+pub use splat_core::{CameraModel, ImageSize, Lens, LensDomain};

@@ -67,11 +67,12 @@ impl SceneScale {
     /// if a tenth of the cameras or points are arbitrary.
     ///
     /// ```
-    /// use splat_data::{Camera, ImageSize, SceneScale};
+    /// use splat_data::{Camera, ImageSize, Lens, SceneScale};
     ///
     /// let camera = |x: f64| Camera {
     ///     viewmat: glam::DMat4::from_translation(glam::DVec3::new(-x, 0.0, 0.0)),
     ///     intrinsics: [50.0, 50.0, 32.0, 24.0],
+    ///     lens: Lens::Pinhole,
     ///     size: ImageSize { width: 64, height: 48 },
     /// };
     /// let cameras = [-0.1, 0.0, 0.1, 0.2, 3_000.0].map(camera);
@@ -190,6 +191,7 @@ mod tests {
         Camera {
             viewmat: glam::DMat4::from_translation(-at),
             intrinsics: [50.0, 50.0, 8.0, 8.0],
+            lens: splat_core::Lens::Pinhole,
             size: splat_core::ImageSize {
                 width: 16,
                 height: 16,

@@ -14,6 +14,7 @@ use splat_ops::ImageSize;
 /// let camera = Camera {
 ///     viewmat: glam::DMat4::IDENTITY,
 ///     intrinsics: [50.0, 50.0, 32.0, 24.0],
+///     lens: splat_model::Lens::Pinhole,
 ///     size: splat_model::ops::ImageSize { width: 64, height: 48 },
 /// };
 /// let mut cameras = CameraTensors::from_camera(&camera, &Device::flex().autodiff());

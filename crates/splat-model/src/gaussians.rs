@@ -26,6 +26,7 @@ use splat_data::{SceneSettings, SplatData};
 /// let camera = splat_model::Camera {
 ///     viewmat: glam::DMat4::IDENTITY,
 ///     intrinsics: [50.0, 50.0, 32.0, 24.0],
+///     lens: splat_model::Lens::Pinhole,
 ///     size: splat_model::ops::ImageSize { width: 64, height: 48 },
 /// };
 /// let camera = CameraTensors::from_camera(&camera, &device);

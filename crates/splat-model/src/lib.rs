@@ -29,7 +29,7 @@ pub use render::{
     RenderSettings, project_gaussians, render, render_projected, render_projected_on,
 };
 pub use rows::{Moments, RowEdit};
-pub use splat_data::{Camera, SceneScale, SplatData};
+pub use splat_data::{Camera, CameraModel, Lens, SceneScale, SplatData};
 pub use splat_ops as ops;
 
 /// The adapter that all tests of this crate share.

@@ -10,7 +10,7 @@ use splat_model::Camera;
 use splat_model::ops::ImageSize;
 
 use super::super::{Failure, text};
-use splat_data::{Capture, View};
+use splat_data::{Capture, Lens, View};
 
 /// Largest side in pixels: a picture of this size takes about 3 GB while rendering.
 const MOST_PIXELS: u32 = 16_384;
@@ -89,6 +89,7 @@ impl FileCamera {
         Ok(Camera {
             viewmat,
             intrinsics: self.intrinsics,
+            lens: Lens::Pinhole,
             size: ImageSize {
                 width: self.width,
                 height: self.height,
@@ -131,6 +132,7 @@ pub(super) fn orbit(scene: &SplatData, count: u32) -> Vec<(String, Camera)> {
                     f64::from(ORBIT_SIZE.width) / 2.0,
                     half_height,
                 ],
+                lens: Lens::Pinhole,
                 size: ORBIT_SIZE,
             };
             (format!("orbit_{index:04}"), camera)

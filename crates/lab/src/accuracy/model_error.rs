@@ -366,6 +366,7 @@ pub fn model_error(
     let camera = Camera {
         viewmat: glam::DMat4::IDENTITY,
         intrinsics: [focal, focal, half + 0.5 - focal * theta.tan(), half + 0.5],
+        lens: splat_data::Lens::Pinhole,
         size: ImageSize {
             width: side,
             height: side,

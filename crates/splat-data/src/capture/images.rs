@@ -8,6 +8,7 @@ use std::sync::Arc;
 
 use image::{DynamicImage, ImageError, ImageFormat, ImageReader};
 use rayon::prelude::*;
+use splat_core::Lens;
 use splat_core::memory::available_memory;
 
 use super::sparse_model::{SparseCamera, SparseImage, SparseModel};
@@ -158,7 +159,9 @@ fn load_one(
             height,
             intrinsics,
             viewmat: image.viewmat(),
+            lens: Lens::Pinhole,
             image: Arc::new(pixels),
+            mask: None,
         },
         transparent,
         suspect,

@@ -42,6 +42,8 @@ fn view(model: &SparseModel, image: &SparseImage) -> View {
         height,
         intrinsics: camera.intrinsics,
         viewmat: image.viewmat(),
+        lens: Lens::Pinhole,
         image: Arc::new(vec![128; 3 * width as usize * height as usize]),
+        mask: None,
     }
 }

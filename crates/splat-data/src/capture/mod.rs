@@ -30,7 +30,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use glam::{DMat4, DVec4};
-use splat_core::ImageSize;
+use splat_core::{ImageSize, Lens};
 
 use crate::Camera;
 
@@ -57,7 +57,7 @@ pub struct Capture {
     pub warnings: Vec<CaptureWarning>,
 }
 
-/// One photo and the pinhole camera that took it.
+/// One photo and the camera that took it.
 #[derive(Debug, Clone)]
 pub struct View {
     /// Name of the photo in the capture, relative to the folder of the photos.
@@ -71,9 +71,13 @@ pub struct View {
     pub intrinsics: [f64; 4],
     /// World to camera, row-major 4x4, last row `0 0 0 1`.
     pub viewmat: [[f64; 4]; 4],
+    /// Camera model and distortion.
+    pub lens: Lens,
     /// 8-bit RGB, row by row from the top: `3 * width * height` bytes. Shared, so that a view is
     /// cheap to clone.
     pub image: Arc<Vec<u8>>,
+    /// Which pixels count, `width * height` bytes from 0 (ignored) to 255; `None` if all do.
+    pub mask: Option<Arc<Vec<u8>>>,
 }
 
 /// A point of structure from motion.
@@ -212,6 +216,7 @@ impl View {
         Camera {
             viewmat: DMat4::from_cols(r0, r1, r2, r3).transpose(),
             intrinsics: self.intrinsics,
+            lens: self.lens,
             size: ImageSize {
                 width: self.width,
                 height: self.height,
@@ -243,19 +248,23 @@ impl View {
             height,
             intrinsics: downscale::intrinsics(self.intrinsics, factor),
             viewmat: self.viewmat,
+            lens: self.lens,
             image: Arc::new(image),
+            mask: None,
         }
     }
 
-    /// Position of a world point in the photo, `(x, y)` in pixels, and its depth along the camera's
-    /// axis. Points at depth 0 have no finite position.
-    pub fn project(&self, point: [f64; 3]) -> ([f64; 2], f64) {
+    /// Position of a world point in the photo, `(x, y)` in pixels, and its
+    /// [`depth`](Lens::depth). `None` if the point is behind the camera, or where the lens is not
+    /// defined.
+    pub fn project(&self, point: [f64; 3]) -> Option<([f64; 2], f64)> {
         let [x, y, z]: [f64; 3] = std::array::from_fn(|row| {
             let r = &self.viewmat[row];
             r[0] * point[0] + r[1] * point[1] + r[2] * point[2] + r[3]
         });
         let [fx, fy, cx, cy] = self.intrinsics;
-        ([fx * x / z + cx, fy * y / z + cy], z)
+        let [a, b] = self.lens.distort([x, y, z])?;
+        Some(([fx * a + cx, fy * b + cy], self.lens.depth([x, y, z])))
     }
 }
 

@@ -93,8 +93,8 @@ mod tests {
         );
         assert_eq!(small.image.len(), 3 * (small.width * small.height) as usize);
         let point = capture.points[7].position;
-        let ([x, y], depth) = whole.project(point);
-        let ([u, v], small_depth) = small.project(point);
+        let ([x, y], depth) = whole.project(point).unwrap();
+        let ([u, v], small_depth) = small.project(point).unwrap();
         assert!((2.0 * u - x).abs() < 1e-9 && (2.0 * v - y).abs() < 1e-9);
         assert_eq!(depth, small_depth);
 

@@ -100,7 +100,9 @@ fn large_and_eight_bit(device: &Device) -> Result<Outcome, AccuracyError> {
         height: 16,
         intrinsics: [16.0, 16.0, 8.0, 8.0],
         viewmat: [[0.0; 4]; 4],
+        lens: splat_data::Lens::Pinhole,
         image: Arc::new((0..=255).flat_map(|level| [level; 3]).collect()),
+        mask: None,
     };
     let photo = splat_trainer::photo(&view, device)
         .try_into_vec_as::<f64>()

@@ -42,6 +42,7 @@ fn the_closed_form_is_the_integral_along_the_ray() {
                 any_vector(&mut rng, 3.0),
             ),
             intrinsics: [100.0, 100.0, 50.0, 50.0],
+            lens: splat_data::Lens::Pinhole,
             size: ImageSize {
                 width: 100,
                 height: 100,
@@ -111,6 +112,7 @@ fn far_away_scenes_are_blended_alike() {
     let camera = Camera {
         viewmat: DMat4::IDENTITY,
         intrinsics: [10.0 * AWAY, 10.0 * AWAY, 16.0, 16.0],
+        lens: splat_data::Lens::Pinhole,
         size: ImageSize {
             width: 32,
             height: 32,
@@ -168,6 +170,7 @@ fn a_near_splat_in_a_wide_view_is_off_by_what_is_stated() {
     let camera = Camera {
         viewmat: DMat4::IDENTITY,
         intrinsics: [focal, focal, 64.0, 64.0],
+        lens: splat_data::Lens::Pinhole,
         size: ImageSize {
             width: SIDE,
             height: SIDE,
@@ -223,6 +226,7 @@ fn what_cannot_be_drawn_is_not() {
     let camera = Camera {
         viewmat: DMat4::IDENTITY,
         intrinsics: [8.0, 8.0, 4.0, 4.0],
+        lens: splat_data::Lens::Pinhole,
         size: ImageSize {
             width: 8,
             height: 8,

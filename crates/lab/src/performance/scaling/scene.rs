@@ -9,7 +9,7 @@ use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
 use splat_data::Capture;
-use splat_data::{Point, Split, View};
+use splat_data::{Lens, Point, Split, View};
 
 /// Views.
 const VIEWS: usize = 4;
@@ -143,7 +143,9 @@ fn view(index: usize, width: u32, height: u32) -> View {
             [0.0, 0.0, 1.0, 0.0],
             [0.0, 0.0, 0.0, 1.0],
         ],
+        lens: Lens::Pinhole,
         image: Arc::new(image),
+        mask: None,
     }
 }
 
@@ -187,8 +189,10 @@ mod tests {
         for view in a.train_views() {
             assert_eq!(view.image.len(), 3 * 63 * 48);
             let inside = a.points.iter().filter(|point| {
-                let ([x, y], z) = view.project(point.position);
-                z > 0.0 && (0.0..63.0).contains(&x) && (0.0..48.0).contains(&y)
+                let Some(([x, y], _)) = view.project(point.position) else {
+                    return false;
+                };
+                (0.0..63.0).contains(&x) && (0.0..48.0).contains(&y)
             });
             // The margin is a tenth of each side.
             let share = inside.count() as f64 / 1000.0;

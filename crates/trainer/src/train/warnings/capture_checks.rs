@@ -82,9 +82,11 @@ impl Outlook {
         let center = view.camera().position();
         let distances: Vec<f64> = positions.iter().map(|p| p.distance(center)).collect();
         let seen = |position: &&DVec3| {
-            let ([x, y], depth) = view.project(position.to_array());
+            let Some(([x, y], _)) = view.project(position.to_array()) else {
+                return false;
+            };
             let inside = |at: f64, side: u32| at > 0.0 && at < f64::from(side);
-            depth > 0.0 && inside(x, view.width) && inside(y, view.height)
+            inside(x, view.width) && inside(y, view.height)
         };
         Self {
             near: quantile(distances.iter().copied(), 0.01),

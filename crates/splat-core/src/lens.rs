@@ -1,0 +1,202 @@
+//! Lenses: what lies between a point in camera space and the image plane.
+//!
+//! A point p = (x, y, z) in camera space falls on the normalised image plane at (a', b'), and in the
+//! image at (fx a' + cx, fy b' + cy):
+//!
+//! ```text
+//! pinhole         a' = x/z,  b' = y/z
+//! opencv          a = x/z, b = y/z, q = a^2 + b^2
+//!                 L = (1 + k1 q + k2 q^2 + k3 q^3) / (1 + k4 q + k5 q^2 + k6 q^3)
+//!                 a' = a L + 2 p1 a b + p2 (q + 2 a^2),  b' = b L + p1 (q + 2 b^2) + 2 p2 a b
+//! opencv_fisheye  rho = hypot(x, y), theta = atan2(rho, z)
+//!                 theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8)
+//!                 a' = theta_d x / rho,  b' = theta_d y / rho
+//! ```
+//!
+//! These are the models of OpenCV's `calib3d` and `fisheye` modules, and COLMAP's of the same names.
+
+mod fisheye;
+mod opencv;
+mod polynomial;
+#[cfg(test)]
+mod tests;
+
+use crate::ImageSize;
+
+/// A family of lenses.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
+pub enum CameraModel {
+    /// Perspective without distortion.
+    #[default]
+    Pinhole,
+    /// Perspective with radial and tangential distortion: OpenCV's rational model.
+    OpenCv,
+    /// Equidistant, with a polynomial of the angle: OpenCV's fisheye model.
+    OpenCvFisheye,
+}
+
+impl CameraModel {
+    /// All models.
+    pub const ALL: [Self; 3] = [Self::Pinhole, Self::OpenCv, Self::OpenCvFisheye];
+
+    /// Name in files: `pinhole`, `opencv` or `opencv_fisheye`.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Pinhole => "pinhole",
+            Self::OpenCv => "opencv",
+            Self::OpenCvFisheye => "opencv_fisheye",
+        }
+    }
+
+    /// The model of this [`name`](Self::name).
+    pub fn of_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|model| model.name() == name)
+    }
+
+    /// Number of distortion coefficients.
+    pub const fn coefficients(self) -> usize {
+        match self {
+            Self::Pinhole => 0,
+            Self::OpenCv => 8,
+            Self::OpenCvFisheye => 4,
+        }
+    }
+
+    /// Names of the coefficients, in their order.
+    pub const fn coefficient_names(self) -> &'static [&'static str] {
+        match self {
+            Self::Pinhole => &[],
+            Self::OpenCv => &["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"],
+            Self::OpenCvFisheye => &["k1", "k2", "k3", "k4"],
+        }
+    }
+}
+
+/// A camera model with its distortion coefficients. Focal lengths and principal point are apart
+/// from it, because another resolution changes those and leaves these.
+///
+/// ```
+/// use splat_core::Lens;
+///
+/// let barrel = Lens::OpenCv([-0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+/// let [a, b] = barrel.distort([0.5, 0.0, 1.0]).unwrap();
+/// assert!((a - 0.5 * (1.0 - 0.1 * 0.25)).abs() < 1e-15 && b == 0.0);
+/// let [x, _, z] = barrel.undistort([a, b]).unwrap();
+/// assert!((x / z - 0.5).abs() < 1e-14);
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum Lens {
+    /// No distortion.
+    #[default]
+    Pinhole,
+    /// k1, k2, p1, p2, k3, k4, k5, k6 of [`CameraModel::OpenCv`].
+    OpenCv([f64; 8]),
+    /// k1, k2, k3, k4 of [`CameraModel::OpenCvFisheye`].
+    OpenCvFisheye([f64; 4]),
+}
+
+/// Where a lens is defined, in [`CameraModel`]'s own variable.
+///
+/// Beyond `limit` the model folds back on itself, so that two directions would share a pixel;
+/// splats there are culled.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LensDomain {
+    /// Largest radius `hypot(x, y) / z` (perspective) or angle from the axis in radians (fisheye).
+    pub limit: f64,
+    /// Radius at which the Jacobian of a perspective lens is evaluated at most; 0 for others.
+    pub clamp: f64,
+}
+
+impl Lens {
+    /// The lens of this model with these coefficients; `None` when their number is wrong.
+    pub fn new(model: CameraModel, coefficients: &[f64]) -> Option<Self> {
+        Some(match model {
+            CameraModel::Pinhole => coefficients.is_empty().then_some(Self::Pinhole)?,
+            CameraModel::OpenCv => Self::OpenCv(coefficients.try_into().ok()?),
+            CameraModel::OpenCvFisheye => Self::OpenCvFisheye(coefficients.try_into().ok()?),
+        })
+    }
+
+    /// The camera model.
+    pub const fn model(&self) -> CameraModel {
+        match self {
+            Self::Pinhole => CameraModel::Pinhole,
+            Self::OpenCv(_) => CameraModel::OpenCv,
+            Self::OpenCvFisheye(_) => CameraModel::OpenCvFisheye,
+        }
+    }
+
+    /// The distortion coefficients, as many as [`CameraModel::coefficients`] says.
+    pub fn coefficients(&self) -> &[f64] {
+        match self {
+            Self::Pinhole => &[],
+            Self::OpenCv(coefficients) => coefficients,
+            Self::OpenCvFisheye(coefficients) => coefficients,
+        }
+    }
+
+    /// The domain in an image of this size: up to the first radius or angle at which the lens stops
+    /// to bend outwards, or its formula has a pole; a fisheye at most to 175 degrees.
+    ///
+    /// `intrinsics` are fx, fy, cx, cy in pixels. The clamp of a perspective lens is 1.15 times the
+    /// largest radius of a corner of the image, and stays inside of the limit.
+    pub fn domain(&self, intrinsics: [f64; 4], size: ImageSize) -> LensDomain {
+        match self {
+            Self::Pinhole => LensDomain {
+                limit: f64::INFINITY,
+                clamp: 0.0,
+            },
+            Self::OpenCv(k) => {
+                let limit = opencv::limit(k);
+                let radius = |[x, y, z]: [f64; 3]| x.hypot(y) / z;
+                let corner = corners(intrinsics, size)
+                    .map(|corner| self.undistort(corner).map_or(f64::INFINITY, radius))
+                    .into_iter()
+                    .fold(0.0, f64::max);
+                LensDomain {
+                    limit,
+                    clamp: (0.999 * limit).min(1.15 * corner),
+                }
+            }
+            Self::OpenCvFisheye(k) => LensDomain {
+                limit: fisheye::limit(k),
+                clamp: 0.0,
+            },
+        }
+    }
+
+    /// Where a point in camera space falls on the normalised image plane; `None` where the lens is
+    /// not defined, for a perspective lens also behind the camera.
+    pub fn distort(&self, [x, y, z]: [f64; 3]) -> Option<[f64; 2]> {
+        match self {
+            Self::Pinhole => (z > 0.0).then(|| [x / z, y / z]),
+            Self::OpenCv(k) => (z > 0.0).then(|| opencv::distort(k, [x / z, y / z]))?,
+            Self::OpenCvFisheye(k) => fisheye::distort(k, [x, y, z]),
+        }
+    }
+
+    /// The depth of a point in camera space by which splats are culled and sorted: z, or for a
+    /// fisheye, which sees behind the image plane, the distance.
+    pub fn depth(&self, [x, y, z]: [f64; 3]) -> f64 {
+        match self {
+            Self::Pinhole | Self::OpenCv(_) => z,
+            Self::OpenCvFisheye(_) => x.hypot(y).hypot(z),
+        }
+    }
+
+    /// The direction in camera space, of length 1 for a fisheye and with z = 1 else, that falls on a
+    /// point of the normalised image plane; `None` where no direction of the domain does.
+    pub fn undistort(&self, point: [f64; 2]) -> Option<[f64; 3]> {
+        match self {
+            Self::Pinhole => Some([point[0], point[1], 1.0]),
+            Self::OpenCv(k) => opencv::undistort(k, point).map(|[a, b]| [a, b, 1.0]),
+            Self::OpenCvFisheye(k) => fisheye::undistort(k, point),
+        }
+    }
+}
+
+/// Corners of an image on the normalised image plane.
+fn corners([fx, fy, cx, cy]: [f64; 4], size: ImageSize) -> [[f64; 2]; 4] {
+    let (w, h) = (f64::from(size.width), f64::from(size.height));
+    [[0.0, 0.0], [w, 0.0], [0.0, h], [w, h]].map(|[x, y]| [(x - cx) / fx, (y - cy) / fy])
+}
