@@ -4,6 +4,8 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 
+use splat_core::Lens;
+
 use super::colmap;
 use super::sparse_model::{SparseImage, SparseModel};
 use super::{Capture, CaptureError, Split, View, images};
