@@ -2,7 +2,7 @@
 //! gsplat appendix).
 //!
 //! Per camera and Gaussian, with W, t the view matrix, R the rotation of the normalised quaternion,
-//! s the scale:
+//! s the scale, here for a pinhole (`opencv.rs` and `fisheye.rs` have other mean2d and J):
 //! ```text
 //! p = W mean + t = (x, y, z)                      mean2d = (fx x/z + cx, fy y/z + cy)
 //! u = clamp(x/z), v = clamp(y/z)                  J = [fx/z, 0, -fx u/z; 0, fy/z, -fy v/z]
@@ -22,11 +22,17 @@
 
 mod backward;
 mod camera;
+mod distorted;
+mod fisheye;
+mod opencv;
+mod pinhole;
 mod splat;
 mod vjp;
 
 use cubecl::prelude::*;
-use splat_core::{ImageSize, PROJECTED_DEPTH, PROJECTED_WIDTH, ProjectSettings, ProjectTensors};
+use splat_core::{
+    CameraModel, ImageSize, PROJECTED_DEPTH, PROJECTED_WIDTH, ProjectSettings, ProjectTensors,
+};
 
 pub use self::backward::project_backward;
 use self::camera::Camera;
@@ -60,8 +66,8 @@ fn uniforms(size: ImageSize, settings: &ProjectSettings) -> UniformsLaunch {
     )
 }
 
-/// The inputs of the projection.
-pub type ProjectInputs = ProjectTensors<Buffer>;
+/// The inputs of the projection; distortion and domain where the model has them.
+pub type ProjectInputs = ProjectTensors<Buffer, Option<Buffer>>;
 
 fn gaussians(inputs: &ProjectInputs) -> usize {
     (inputs.means.len() / 3)
@@ -80,22 +86,26 @@ fn project_forward(
     scales: &[f32],
     viewmats: &[f32],
     intrinsics: &[f32],
+    distortion: ComptimeOption<&[f32]>,
+    domain: ComptimeOption<&[f32]>,
     packed: &mut [f32],
     gaussians: u32,
     cameras: u32,
     s: Uniforms,
+    #[comptime] model: CameraModel,
 ) {
     let gaussians = gaussians as usize;
     let index = ABSOLUTE_POS;
     if index < gaussians * cameras as usize {
         let g = Gaussian::load(means, quats, scales, index % gaussians);
-        let camera = Camera::load(viewmats, intrinsics, index / gaussians);
-        let splat = project_splat(g, camera, s);
+        let c = index / gaussians;
+        let camera = Camera::load(viewmats, intrinsics, &distortion, &domain, c, model);
+        let splat = project_splat(g, camera, s, model);
         let at = index * PROJECTED_WIDTH;
         if splat.visible {
             packed[at] = splat.sight.mean_x;
             packed[at + 1] = splat.sight.mean_y;
-            packed[at + PROJECTED_DEPTH] = splat.sight.p.z;
+            packed[at + PROJECTED_DEPTH] = splat.sight.depth;
             packed[at + 3] = splat.w11 / splat.covariance.k;
             packed[at + 4] = splat.w21 / splat.covariance.k;
             packed[at + 5] = splat.w22 / splat.covariance.k;
@@ -130,6 +140,7 @@ pub fn project(
     client: &Client,
     inputs: &ProjectInputs,
     size: ImageSize,
+    model: CameraModel,
     settings: &ProjectSettings,
 ) -> Buffer {
     let (gaussians, cameras) = (gaussians(inputs), cameras(inputs));
@@ -144,10 +155,13 @@ pub fn project(
             inputs.scales.arg(),
             inputs.viewmats.arg(),
             inputs.intrinsics.arg(),
+            inputs.distortion.as_ref().map(Buffer::arg).into(),
+            inputs.domain.as_ref().map(Buffer::arg).into(),
             packed.arg(),
             gaussians as u32,
             cameras as u32,
             uniforms(size, settings),
+            model,
         );
     }
     packed

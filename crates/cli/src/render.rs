@@ -27,6 +27,8 @@ use crate::report::{probe_folder, refuse_inputs};
 A camera file holds one camera or a list of them:
   {\"name\": \"front\", \"width\": 640, \"height\": 480, \"intrinsics\": [fx, fy, cx, cy],
    \"viewmat\": [[r, r, r, t], [r, r, r, t], [r, r, r, t], [0, 0, 0, 1]]}
+A lens: \"camera_model\": \"opencv\", \"distortion\": [k1, k2, p1, p2, k3, k4, k5, k6]
+     or \"camera_model\": \"opencv_fisheye\", \"distortion\": [k1, k2, k3, k4]
 viewmat maps world to camera (+x right, +y down, +z forward); the first pixel's centre is at (0.5, 0.5).")]
 pub struct RenderArgs {
     /// Scene: a PLY file in the 3DGS layout

@@ -38,7 +38,7 @@ const AUTOSAVE: u64 = 60;
   splat train photos/ --resume out/garden
 
 Writes to DIR: scene.ply, metrics.json, config.toml, curves.svg, losses.csv and views/*.png (truth
-beside render). Ctrl-C finishes the step, writes the scene and a checkpoint to resume from; a second
+beside render); with --refine-poses or --refine-intrinsics also cameras/, a COLMAP model. Ctrl-C finishes the step, writes the scene and a checkpoint to resume from; a second
 Ctrl-C ends at once. A checkpoint is also written every minute, so that --resume goes on after a crash.
 
 --resume takes the settings of the run from its checkpoint, and refuses another capture, another seed
@@ -65,6 +65,12 @@ pub struct TrainArgs {
     /// for every hundred of all photos, whichever is more]
     #[arg(long, value_name = "N")]
     pub max_gaussians: Option<usize>,
+    /// Refine the poses of the training views with the scene
+    #[arg(long)]
+    pub refine_poses: bool,
+    /// Refine focal lengths, principal points and distortion with the scene
+    #[arg(long)]
+    pub refine_intrinsics: bool,
     /// Settings, such as the config.toml of another run; arguments win over it
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
@@ -137,6 +143,8 @@ impl TrainArgs {
         if let Some(most) = self.max_gaussians {
             config.set_max_gaussians(most);
         }
+        config.calibration.poses |= self.refine_poses;
+        config.calibration.intrinsics |= self.refine_intrinsics;
         let invalid = |problem: String| Failure::BadInput(format!("settings: {problem}"));
         config.validate().map_err(invalid)?;
         if let Some(run) = resumed {
@@ -251,9 +259,15 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         ));
         return Ok(());
     }
-    let (scores, saved) = folder.complete(&trained, &capture, &config, &chosen);
-    if let Some(scores) = scores.filter(|scores| !scores.views.is_empty()) {
-        print(&eval::table(&scores))?;
+    let (metrics, saved) = folder.complete(&trained, &capture, &config, &chosen);
+    if let Some(metrics) = metrics.filter(|metrics| !metrics.scores.views.is_empty()) {
+        print(&eval::table(&metrics.scores))?;
+        if let Some(aligned) = &metrics.aligned {
+            let (psnr, ssim) = (aligned.scores.psnr, aligned.scores.ssim);
+            print(&format!(
+                "with the poses of held-out views aligned with the scene: {psnr:.2} dB, SSIM {ssim:.4}\n"
+            ))?;
+        }
     }
     saved?;
     print(&format!(

@@ -135,44 +135,46 @@ impl Lens {
         }
     }
 
+    /// The lens with the limit of its domain, for many points.
+    pub fn bounded(&self) -> BoundedLens {
+        let limit = match self {
+            Self::Pinhole => f64::INFINITY,
+            Self::OpenCv(k) => opencv::limit(k),
+            Self::OpenCvFisheye(k) => fisheye::limit(k),
+        };
+        BoundedLens { lens: *self, limit }
+    }
+
     /// The domain in an image of this size: up to the first radius or angle at which the lens stops
     /// to bend outwards, or its formula has a pole; a fisheye at most to 175 degrees.
     ///
     /// `intrinsics` are fx, fy, cx, cy in pixels. The clamp of a perspective lens is 1.15 times the
     /// largest radius of a corner of the image, and stays inside of the limit.
     pub fn domain(&self, intrinsics: [f64; 4], size: ImageSize) -> LensDomain {
-        match self {
-            Self::Pinhole => LensDomain {
-                limit: f64::INFINITY,
-                clamp: 0.0,
-            },
-            Self::OpenCv(k) => {
-                let limit = opencv::limit(k);
+        let bounded = self.bounded();
+        let limit = bounded.limit;
+        let clamp = match self {
+            Self::Pinhole | Self::OpenCvFisheye(_) => 0.0,
+            Self::OpenCv(_) => {
                 let radius = |[x, y, z]: [f64; 3]| x.hypot(y) / z;
                 let corner = corners(intrinsics, size)
-                    .map(|corner| self.undistort(corner).map_or(f64::INFINITY, radius))
+                    .map(|corner| bounded.undistort(corner).map_or(f64::INFINITY, radius))
                     .into_iter()
                     .fold(0.0, f64::max);
-                LensDomain {
-                    limit,
-                    clamp: (0.999 * limit).min(1.15 * corner),
-                }
+                (0.999 * limit).min(1.15 * corner)
             }
-            Self::OpenCvFisheye(k) => LensDomain {
-                limit: fisheye::limit(k),
-                clamp: 0.0,
-            },
-        }
+        };
+        LensDomain { limit, clamp }
     }
 
-    /// Where a point in camera space falls on the normalised image plane; `None` where the lens is
-    /// not defined, for a perspective lens also behind the camera.
-    pub fn distort(&self, [x, y, z]: [f64; 3]) -> Option<[f64; 2]> {
-        match self {
-            Self::Pinhole => (z > 0.0).then(|| [x / z, y / z]),
-            Self::OpenCv(k) => (z > 0.0).then(|| opencv::distort(k, [x / z, y / z]))?,
-            Self::OpenCvFisheye(k) => fisheye::distort(k, [x, y, z]),
-        }
+    /// [`BoundedLens::distort`] for one point.
+    pub fn distort(&self, p: [f64; 3]) -> Option<[f64; 2]> {
+        self.bounded().distort(p)
+    }
+
+    /// [`BoundedLens::undistort`] for one point.
+    pub fn undistort(&self, point: [f64; 2]) -> Option<[f64; 3]> {
+        self.bounded().undistort(point)
     }
 
     /// The depth of a point in camera space by which splats are culled and sorted: z, or for a
@@ -183,14 +185,33 @@ impl Lens {
             Self::OpenCvFisheye(_) => x.hypot(y).hypot(z),
         }
     }
+}
+
+/// A lens with the limit of its domain, which takes longer to find than a point to map.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct BoundedLens {
+    lens: Lens,
+    limit: f64,
+}
+
+impl BoundedLens {
+    /// Where a point in camera space falls on the normalised image plane; `None` where the lens is
+    /// not defined, for a perspective lens also behind the camera.
+    pub fn distort(&self, [x, y, z]: [f64; 3]) -> Option<[f64; 2]> {
+        match &self.lens {
+            Lens::Pinhole => (z > 0.0).then(|| [x / z, y / z]),
+            Lens::OpenCv(k) => (z > 0.0).then(|| opencv::distort(k, self.limit, [x / z, y / z]))?,
+            Lens::OpenCvFisheye(k) => fisheye::distort(k, self.limit, [x, y, z]),
+        }
+    }
 
     /// The direction in camera space, of length 1 for a fisheye and with z = 1 else, that falls on a
     /// point of the normalised image plane; `None` where no direction of the domain does.
     pub fn undistort(&self, point: [f64; 2]) -> Option<[f64; 3]> {
-        match self {
-            Self::Pinhole => Some([point[0], point[1], 1.0]),
-            Self::OpenCv(k) => opencv::undistort(k, point).map(|[a, b]| [a, b, 1.0]),
-            Self::OpenCvFisheye(k) => fisheye::undistort(k, point),
+        match &self.lens {
+            Lens::Pinhole => Some([point[0], point[1], 1.0]),
+            Lens::OpenCv(k) => opencv::undistort(k, self.limit, point).map(|[a, b]| [a, b, 1.0]),
+            Lens::OpenCvFisheye(k) => fisheye::undistort(k, self.limit, point),
         }
     }
 }

@@ -1,6 +1,7 @@
 //! Constants, layouts and settings shared by the kernels, the ops and the file readers, and a
 //! measure of available memory. No dependencies.
 
+pub mod angle;
 pub mod exp;
 mod lens;
 pub mod memory;
@@ -10,7 +11,7 @@ mod settings;
 mod sh;
 mod tensors;
 
-pub use lens::{CameraModel, Lens, LensDomain};
+pub use lens::{BoundedLens, CameraModel, Lens, LensDomain};
 pub use packed::{PROJECTED_DEPTH, PROJECTED_EXTENT, PROJECTED_WIDTH, SPLAT_SIZE_MAX, TILE_SIDE};
 pub use settings::{
     ALPHA_MIN, Activation, AdamRows, AdamStep, ClampGradient, ImageSize, Perturbation,

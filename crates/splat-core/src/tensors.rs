@@ -118,6 +118,12 @@ tensors! {
         viewmats,
         /// fx, fy, cx, cy in pixels `[C, 4]`.
         intrinsics,
+    } optional {
+        /// Distortion coefficients `[C, K]`; absent for a pinhole.
+        distortion,
+        /// Domains of the lenses `[C, 2]`, see `LensDomain`; absent for a pinhole. Never has a
+        /// gradient.
+        domain,
     }
 }
 

@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use splat_data::Camera;
-use splat_ops::ImageSize;
+use splat_ops::{Distortion, ImageSize, Intrinsics};
 
 /// C cameras of one image size, as tensors. Call `require_grad` on them to refine poses or
 /// intrinsics.
@@ -28,6 +28,8 @@ pub struct CameraTensors {
     pub viewmats: Tensor<3>,
     /// fx, fy, cx, cy in pixels, `[C, 4]`.
     pub intrinsics: Tensor<2>,
+    /// Distortion of the lenses; `None` for pinhole cameras.
+    pub distortion: Option<Distortion>,
     /// Image size in pixels.
     pub size: ImageSize,
 }
@@ -39,11 +41,33 @@ impl CameraTensors {
             .flat_map(|i| camera.viewmat.row(i).to_array())
             .map(|value| value as f32)
             .collect();
-        let intrinsics = camera.intrinsics.map(|value| value as f32);
+        let row = |values: &[f64]| {
+            let values: Vec<f32> = values.iter().map(|value| *value as f32).collect();
+            let shape = [1, values.len()];
+            Tensor::<2>::from_data(TensorData::new(values, shape), device)
+        };
+        let lens = &camera.lens;
+        let distortion = (!lens.coefficients().is_empty()).then(|| {
+            let domain = lens.domain(camera.intrinsics, camera.size);
+            Distortion {
+                model: lens.model(),
+                coefficients: row(lens.coefficients()),
+                domain: row(&[domain.limit, domain.clamp]),
+            }
+        });
         Self {
             viewmats: Tensor::from_data(TensorData::new(rows, [1, 4, 4]), device),
-            intrinsics: Tensor::from_data(TensorData::new(intrinsics.to_vec(), [1, 4]), device),
+            intrinsics: row(&camera.intrinsics),
+            distortion,
             size: camera.size,
+        }
+    }
+
+    /// The intrinsics with the distortion, as [`project`](splat_ops::project()) takes them.
+    pub fn lens_intrinsics(&self) -> Intrinsics {
+        Intrinsics {
+            pinhole: self.intrinsics.clone(),
+            distortion: self.distortion.clone(),
         }
     }
 

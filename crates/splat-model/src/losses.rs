@@ -12,7 +12,7 @@
 
 use burn::tensor::Tensor;
 use derive_setters::Setters;
-use splat_ops::{OpError, SsimArgs, photometric};
+use splat_ops::{OpError, SsimArgs, photometric, ssim_map};
 
 /// Mean absolute difference, `[1]`.
 pub fn l1(image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
@@ -27,6 +27,23 @@ pub fn mse(image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
 /// Peak signal-to-noise ratio in dB, `[1]`: `-10 log10(mse)` of images clamped to [0, 1].
 pub fn psnr(image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
     mse(image.clamp(0.0, 1.0), target.clamp(0.0, 1.0)).log() * (-10.0 / core::f64::consts::LN_10)
+}
+
+/// [`psnr`] over the pixels that a mask `[B, H, W, 1]` keeps, from 0 (ignored) to 1; NaN if it keeps
+/// none.
+pub fn psnr_masked(image: Tensor<4>, target: Tensor<4>, mask: Tensor<4>) -> Tensor<1> {
+    let squares = (image.clamp(0.0, 1.0) - target.clamp(0.0, 1.0)).square();
+    mean_of_kept(squares, mask).log() * (-10.0 / core::f64::consts::LN_10)
+}
+
+/// Mean over the pixels that a mask `[B, H, W, 1]` keeps, and over channels.
+fn mean_of_kept(values: Tensor<4>, mask: Tensor<4>) -> Tensor<1> {
+    let [.., channels] = values.dims();
+    let kept = mask.clone().sum() * channels as f64;
+    // Selected rather than multiplied by zero, which would let NaN through.
+    let ignored = mask.clone().equal_elem(0.0).repeat_dim(3, channels);
+    let values = values * mask.repeat_dim(3, channels);
+    values.mask_fill(ignored, 0.0).sum() / kept
 }
 
 /// Settings of structural similarity; the defaults are those of Wang et al. 2004 for images in [0,
@@ -92,6 +109,36 @@ pub fn ssim(
     settings: &SsimSettings,
 ) -> Result<Tensor<1>, OpError> {
     Ok(photometric(image, target, &settings.args())?.ssim())
+}
+
+/// [`ssim`] over the pixels that a mask `[B, H, W, 1]` keeps, from 0 (ignored) to 1: the similarity
+/// of both images times the mask, as in gsplat, and its mean over the pixels that are kept. NaN if
+/// there are none.
+///
+/// # Errors
+/// When the shapes differ or the window size is even.
+pub fn ssim_masked(
+    image: Tensor<4>,
+    target: Tensor<4>,
+    mask: Tensor<4>,
+    settings: &SsimSettings,
+) -> Result<Tensor<1>, OpError> {
+    let [_, h, w, channels] = image.dims();
+    let all = mask.clone().repeat_dim(3, channels);
+    let map = ssim_map(image * all.clone(), target * all, &settings.args())?;
+    // Of an image that the window fits into, the pixels whose window lies inside.
+    let edge = settings.window / 2;
+    let (map, mask) = match h >= settings.window && w >= settings.window {
+        false => (map, mask),
+        true => {
+            let inside = |image: Tensor<4>| {
+                let rows = image.narrow(1, edge, h - 2 * edge);
+                rows.narrow(2, edge, w - 2 * edge)
+            };
+            (inside(map), inside(mask))
+        }
+    };
+    Ok(mean_of_kept(map, mask))
 }
 
 #[cfg(all(test, feature = "cpu"))]
@@ -180,6 +227,44 @@ mod tests {
             let error = (f64::from(gradient[at]) - expected).abs() / f64::from(largest);
             assert!(error < 1e-5, "pixel {at}: {} and {expected}", gradient[at]);
         }
+    }
+
+    #[test]
+    fn pixels_that_a_mask_ignores_change_no_score() {
+        let [x, y] = images();
+        let mask = Tensor::<4>::ones([2, 19, 23, 1], &Device::flex());
+        let settings = SsimSettings::default();
+        let scores = |x: &[f64], mask: &Tensor<4>| {
+            let psnr = psnr_masked(tensor(x), tensor(&y), mask.clone());
+            let ssim = ssim_masked(tensor(x), tensor(&y), mask.clone(), &settings).unwrap();
+            [psnr, ssim].map(|score| score.into_scalar::<f32>())
+        };
+        // A mask that keeps everything changes nothing.
+        let [all_psnr, all_ssim] = scores(&x, &mask);
+        let plain = psnr(tensor(&x), tensor(&y)).into_scalar::<f32>();
+        assert!((all_psnr - plain).abs() < 1e-4);
+        let plain = ssim(tensor(&x), tensor(&y), &settings)
+            .unwrap()
+            .into_scalar::<f32>();
+        assert!((all_ssim - plain).abs() < 1e-5);
+
+        // The right half is ignored, whatever is there.
+        let kept = mask.narrow(2, 0, 12);
+        let mask = Tensor::cat(
+            vec![kept, Tensor::zeros([2, 19, 11, 1], &Device::flex())],
+            2,
+        );
+        let before = scores(&x, &mask);
+        let mut spoilt = x.clone();
+        for (at, value) in spoilt.iter_mut().enumerate() {
+            if at / 3 % 23 >= 12 {
+                *value = 1.0 - *value;
+            }
+        }
+        assert_eq!(scores(&spoilt, &mask), before);
+        assert_ne!(before, [all_psnr, all_ssim]);
+        let nothing = Tensor::zeros([2, 19, 23, 1], &Device::flex());
+        assert!(scores(&x, &nothing).iter().all(|score| score.is_nan()));
     }
 
     #[test]

@@ -94,7 +94,7 @@ pub fn project_gaussians<M: SplatModel>(
         model.quats(),
         model.scales(),
         cameras.viewmats.clone(),
-        cameras.intrinsics.clone(),
+        cameras.lens_intrinsics(),
         cameras.size,
         &settings.project,
     )

@@ -75,7 +75,7 @@ macro_rules! inputs {
 
 inputs! {
     /// Inputs of [`ProjectOps`].
-    ProjectInputs = ProjectTensors<FloatTensor<B>>;
+    ProjectInputs = ProjectTensors<FloatTensor<B>, Option<FloatTensor<B>>>;
     /// Inputs of [`SphericalHarmonicsOps`].
     SphericalHarmonicsInputs = SphericalHarmonicsTensors<FloatTensor<B>>;
     /// Inputs of [`ShColorsOps`].

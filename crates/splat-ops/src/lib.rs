@@ -77,6 +77,8 @@
 //!   pixels.
 //! - Quaternions are (w, x, y, z) of any non-zero length; scales are linear and positive; opacities
 //!   lie in (0, 1).
+//! - Cameras are pinholes, or have the distortion of OpenCV's perspective or fisheye model
+//!   ([`Intrinsics`], [`Lens`]).
 //! - C is the number of cameras, N of Gaussians, D of colour channels.
 
 pub mod backend;
@@ -94,6 +96,7 @@ pub mod cpu;
 mod cube;
 pub mod device;
 mod error;
+mod intrinsics;
 mod perturb;
 mod photometric;
 mod project;
@@ -115,15 +118,17 @@ pub use cubecl;
 #[cfg(feature = "cpu")]
 pub use device::rasterize_work;
 pub use error::{ErrorSlot, OpError};
+pub use intrinsics::{Distortion, Intrinsics};
 pub use perturb::perturb_means;
 pub use photometric::{Photometric, Target, photometric, photometric_masked};
 pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};
 pub use screen_statistics::ScreenStatistics;
 pub use settings::{
-    Activation, AdamRows, AdamStep, ClampGradient, ImageSize, Perturbation, ProjectSettings,
-    RasterizeSettings, ShColorSettings, SsimArgs,
+    Activation, AdamRows, AdamStep, CameraModel, ClampGradient, ImageSize, Perturbation,
+    ProjectSettings, RasterizeSettings, ShColorSettings, SsimArgs,
 };
 pub use sh_colors::sh_colors;
 pub use spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count, spherical_harmonics};
+pub use splat_core::{Lens, LensDomain};
 pub use ssim::ssim_map;

@@ -7,7 +7,7 @@ use tracing::trace_span;
 use crate::backend::{OpInputs, PROJECTED_WIDTH, ProjectOps, ProjectTensors, ScreenProbeOps};
 use crate::check::Checker;
 use crate::settings::ProjectArgs;
-use crate::{ImageSize, OpError, ProjectSettings};
+use crate::{CameraModel, ImageSize, Intrinsics, OpError, ProjectSettings};
 
 /// Screen splats of N Gaussians in C cameras, as [`project`] returns them.
 ///
@@ -52,7 +52,7 @@ impl Projected {
         self.columns(0, 2)
     }
 
-    /// Camera z `[C, N]`, in world units.
+    /// Depth `[C, N]`, in world units: camera z, or the distance for a fisheye.
     pub fn depths(&self) -> Tensor<2> {
         self.columns(2, 1).squeeze_dim(2)
     }
@@ -162,13 +162,17 @@ fn tracked(leaf: Tensor<3>) -> Tensor<3> {
 /// - `scales` `[N, 3]`: linear standard deviations, world units.
 /// - `viewmats` `[C, 4, 4]`: world to camera. The gradient treats the upper twelve entries as
 ///   independent; the bottom row's is zero.
-/// - `intrinsics` `[C, 4]`: fx, fy, cx, cy in pixels.
+/// - `intrinsics`: fx, fy, cx, cy `[C, 4]` in pixels, or [`Intrinsics`] with the distortion of a
+///   lens, whose coefficients have a gradient like every other input.
 /// - `size`: image size, for culling and for the clamp of the Jacobian.
 ///
-/// The 2D covariance is `V V^T + eps2d I`, V = J W R diag(s), with its determinant from the
+/// The screen mean is that of the camera model, exactly; J is the model's Jacobian at the mean. For
+/// perspective cameras it is evaluated inside the image and a margin around it, because EWA's
+/// approximation explodes beyond. The 2D covariance is `V V^T + eps2d I`, V = J W R diag(s), with its determinant from the
 /// minors of V, which keeps needles exact in single precision. Splats are culled (row of zeros, no
-/// gradient) when their depth is outside [near, far], when they do not reach the image, when their
-/// quaternion has no length, or when one of their fields is not finite.
+/// gradient) when their depth is outside [near, far], when they are outside of the lens's
+/// domain, when they do not reach the image, when their quaternion has no length, or when one of
+/// their fields is not finite.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};
@@ -199,10 +203,14 @@ pub fn project(
     quats: Tensor<2>,
     scales: Tensor<2>,
     viewmats: Tensor<3>,
-    intrinsics: Tensor<2>,
+    intrinsics: impl Into<Intrinsics>,
     size: ImageSize,
     settings: &ProjectSettings,
 ) -> Result<Projected, OpError> {
+    let Intrinsics {
+        pinhole: intrinsics,
+        distortion,
+    } = intrinsics.into();
     let check = Checker::new("project", "means", &means)?;
     let [n, _] = means.dims();
     let [c, _, _] = viewmats.dims();
@@ -211,20 +219,28 @@ pub fn project(
     check.tensor("scales", &scales, [Some(n), Some(3)], "[N, 3]")?;
     check.tensor("viewmats", &viewmats, [None, Some(4), Some(4)], "[C, 4, 4]")?;
     check.tensor("intrinsics", &intrinsics, [Some(c), Some(4)], "[C, 4]")?;
+    if let Some(distortion) = &distortion {
+        distortion.check(&check, c)?;
+    }
     check_size(&check, size)?;
     if c == 0 {
         return Err(check.argument("needs at least one camera".into()));
     }
 
+    let model = (distortion.as_ref()).map_or(CameraModel::Pinhole, |distortion| distortion.model);
+    let (coefficients, domain) = distortion.map(|d| (d.coefficients, d.domain)).unzip();
     let inputs = OpInputs(ProjectTensors {
         means: means.into_dispatch(),
         quats: quats.into_dispatch(),
         scales: scales.into_dispatch(),
         viewmats: viewmats.into_dispatch(),
         intrinsics: intrinsics.into_dispatch(),
+        distortion: coefficients.map(Tensor::into_dispatch),
+        domain: domain.map(|domain| domain.detach().into_dispatch()),
     });
     let args = ProjectArgs {
         size,
+        model,
         settings: *settings,
     };
     let _span = trace_span!("project").entered();

@@ -1,8 +1,8 @@
 //! Sizes and settings of the ops. Every constant of the method is a field with a default.
 
 pub use splat_core::{
-    Activation, AdamRows, AdamStep, ClampGradient, ImageSize, Perturbation, ProjectSettings,
-    RasterizeSettings, ShColorSettings, SsimArgs,
+    Activation, AdamRows, AdamStep, CameraModel, ClampGradient, ImageSize, Perturbation,
+    ProjectSettings, RasterizeSettings, ShColorSettings, SsimArgs,
 };
 
 use crate::ErrorSlot;
@@ -12,6 +12,8 @@ use crate::ErrorSlot;
 pub struct ProjectArgs {
     /// Image size.
     pub size: ImageSize,
+    /// Camera model of all cameras.
+    pub model: CameraModel,
     /// Settings.
     pub settings: ProjectSettings,
 }

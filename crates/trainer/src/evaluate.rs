@@ -3,7 +3,7 @@
 use burn::tensor::{Device, Tensor};
 use serde::Serialize;
 use splat_data::View;
-use splat_model::losses::{SsimSettings, psnr, ssim};
+use splat_model::losses::{SsimSettings, psnr, psnr_masked, ssim, ssim_masked};
 use splat_model::ops::OpError;
 use splat_model::ops::device::to_host;
 use splat_model::{
@@ -11,7 +11,7 @@ use splat_model::{
 };
 
 use crate::hooks::{HookView, Hooks, Purpose};
-use crate::photo::photo;
+use crate::photo::{mask, photo};
 
 /// Scores of one view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -35,7 +35,7 @@ pub struct Scores {
     pub views: Vec<ViewScore>,
 }
 
-/// Renders every view and compares it with its photo. `each` receives every view with its image, `H
+/// Renders every view and compares it with its photo, over the pixels that its mask keeps. `each` receives every view with its image, `H
 /// x W x 3` values clamped to [0, 1], for callers that keep images. [`Trainer`](crate::Trainer) has
 /// an example.
 ///
@@ -67,10 +67,21 @@ pub(crate) fn evaluate_with<M: SplatModel>(
         let scalar = |value: Tensor<1>| -> Result<f64, OpError> {
             Ok(to_host(value)?.first().copied().map_or(f64::NAN, f64::from))
         };
+        let settings = SsimSettings::default();
+        let [psnr, ssim] = match mask(view, device) {
+            None => [
+                psnr(image.clone(), target.clone()),
+                ssim(image.clone(), target, &settings)?,
+            ],
+            Some(mask) => [
+                psnr_masked(image.clone(), target.clone(), mask.clone()),
+                ssim_masked(image.clone(), target, mask, &settings)?,
+            ],
+        };
         scores.push(ViewScore {
             name: view.name.clone(),
-            psnr: scalar(psnr(image.clone(), target.clone()))?,
-            ssim: scalar(ssim(image.clone(), target, &SsimSettings::default())?)?,
+            psnr: scalar(psnr)?,
+            ssim: scalar(ssim)?,
         });
         each(view, to_host(image)?);
     }
@@ -99,10 +110,13 @@ fn rendered<M: SplatModel>(
 }
 
 impl Scores {
-    /// Adds the means to scores of views; NaN if there are no views.
+    /// Adds the means to scores of views; NaN if there are no views. A view without a score, because
+    /// its mask keeps no pixel, counts in no mean.
     pub fn of_views(views: Vec<ViewScore>) -> Self {
         let mean = |score: fn(&ViewScore) -> f64| {
-            views.iter().map(score).sum::<f64>() / views.len() as f64
+            let scores = views.iter().map(score).filter(|score| !score.is_nan());
+            let scores: Vec<f64> = scores.collect();
+            scores.iter().sum::<f64>() / scores.len() as f64
         };
         Self {
             psnr: mean(|score| score.psnr),

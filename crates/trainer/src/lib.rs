@@ -1,13 +1,15 @@
 //! The training loop, checkpoints and evaluation.
 
+pub mod calibration;
 mod evaluate;
 mod hooks;
 mod photo;
 mod train;
 
+pub use calibration::CalibrationSettings;
 pub use evaluate::{Scores, ViewScore, evaluate};
 pub use hooks::{Hook, HookView, Purpose};
-pub use photo::photo;
+pub use photo::{mask, photo};
 #[doc(hidden)]
 pub use train::expected_checksum;
 pub use train::{

@@ -19,6 +19,14 @@ pub(crate) fn pixels_u8(view: &View, device: &Device) -> Tensor<4, Int> {
     Tensor::from_data(TensorData::new(view.image.to_vec(), shape), (device, dtype))
 }
 
+/// The mask of a view, `[1, H, W, 1]` in [0, 1]; `None` if all pixels count.
+pub fn mask(view: &View, device: &Device) -> Option<Tensor<4>> {
+    let mask = view.mask.as_ref()?;
+    let values: Vec<f32> = mask.iter().map(|value| f32::from(*value) / 255.0).collect();
+    let shape = [1, view.height as usize, view.width as usize, 1];
+    Some(Tensor::from_data(TensorData::new(values, shape), device))
+}
+
 /// Converts levels from 0 to 255 to values in [0, 1].
 pub(crate) fn values(pixels: Tensor<4, Int>) -> Tensor<4> {
     pixels.float() / 255.0

@@ -1,7 +1,7 @@
 //! Gradients of all Gaussians and cameras.
 
 use cubecl::prelude::*;
-use splat_core::{ImageSize, PROJECTED_WIDTH, ProjectSettings, ProjectTensors};
+use splat_core::{CameraModel, ImageSize, PROJECTED_WIDTH, ProjectSettings, ProjectTensors};
 
 use super::camera::Camera;
 use super::splat::{Gaussian, project_splat};
@@ -10,8 +10,12 @@ use super::{ProjectInputs, Uniforms, cameras, gaussians, uniforms};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
 use crate::math::{Quat, Vec3};
 
-/// Values of a camera's gradient: three rows [W | t], then fx, fy, cx, cy.
-const CAMERA_VALUES: usize = 16;
+/// Values of a camera's gradient: three rows [W | t], then fx, fy, cx, cy, then the coefficients of
+/// the lens, filled up to a power of two, which divides the units of a workgroup.
+const fn camera_values(model: CameraModel) -> usize {
+    (16 + model.coefficients()).next_power_of_two()
+}
+
 /// Gaussians summed by one unit of the camera gradient.
 const CAMERA_ITEMS: usize = 4;
 /// Gaussians summed by one workgroup of the camera gradient.
@@ -25,6 +29,8 @@ fn project_backward_gaussians(
     scales: &[f32],
     viewmats: &[f32],
     intrinsics: &[f32],
+    distortion: ComptimeOption<&[f32]>,
+    domain: ComptimeOption<&[f32]>,
     grad_packed: &[f32],
     grad_means: &mut [f32],
     grad_quats: &mut [f32],
@@ -32,6 +38,7 @@ fn project_backward_gaussians(
     gaussians: u32,
     cameras: u32,
     s: Uniforms,
+    #[comptime] model: CameraModel,
     #[comptime] needs_grad: ProjectTensors<bool>,
 ) {
     let gaussians = gaussians as usize;
@@ -49,11 +56,11 @@ fn project_backward_gaussians(
         let mut scale_y = 0.0f32;
         let mut scale_z = 0.0f32;
         for c in 0..cameras as usize {
-            let camera = Camera::load(viewmats, intrinsics, c);
-            let splat = project_splat(g, camera, s);
+            let camera = Camera::load(viewmats, intrinsics, &distortion, &domain, c, model);
+            let splat = project_splat(g, camera, s, model);
             if splat.visible {
                 let at = (c * gaussians + index) * PROJECTED_WIDTH;
-                let grad = project_vjp(g, camera, splat, grad_packed, at);
+                let grad = project_vjp(g, camera, splat, grad_packed, at, s, model);
                 mean_x += grad.camera.mean.x;
                 mean_y += grad.camera.mean.y;
                 mean_z += grad.camera.mean.z;
@@ -86,14 +93,18 @@ fn project_backward_cameras(
     scales: &[f32],
     viewmats: &[f32],
     intrinsics: &[f32],
+    distortion: ComptimeOption<&[f32]>,
+    domain: ComptimeOption<&[f32]>,
     grad_packed: &[f32],
     partials: &mut [f32],
     gaussians: u32,
     cameras: u32,
     blocks: u32,
     s: Uniforms,
+    #[comptime] model: CameraModel,
 ) {
-    let mut shared = Shared::new_slice(CAMERA_VALUES * CUBE_UNITS_USIZE);
+    let values = comptime!(camera_values(model));
+    let mut shared = Shared::new_slice(comptime!(camera_values(model) * CUBE_UNITS_USIZE));
     let mut parts = Shared::new_slice(CUBE_UNITS_USIZE);
     let gaussians = gaussians as usize;
     let blocks = blocks as usize;
@@ -101,21 +112,21 @@ fn project_backward_cameras(
     let c = CUBE_POS / blocks;
     let block = CUBE_POS % blocks;
 
-    let mut sums = Array::<f32>::new(CAMERA_VALUES);
+    let mut sums = Array::<f32>::new(values);
     #[unroll]
-    for k in 0..CAMERA_VALUES {
+    for k in 0..values {
         sums[k] = 0.0f32;
     }
     if c < cameras as usize {
-        let camera = Camera::load(viewmats, intrinsics, c);
+        let camera = Camera::load(viewmats, intrinsics, &distortion, &domain, c, model);
         for item in 0..CAMERA_ITEMS {
             let index = block * CAMERA_BLOCK + item * CUBE_UNITS_USIZE + unit;
             if index < gaussians {
                 let g = Gaussian::load(means, quats, scales, index);
-                let splat = project_splat(g, camera, s);
+                let splat = project_splat(g, camera, s, model);
                 if splat.visible {
                     let at = (c * gaussians + index) * PROJECTED_WIDTH;
-                    let grad = project_vjp(g, camera, splat, grad_packed, at);
+                    let grad = project_vjp(g, camera, splat, grad_packed, at, s, model);
                     sums[0] += grad.camera.w.r0.x;
                     sums[1] += grad.camera.w.r0.y;
                     sums[2] += grad.camera.w.r0.z;
@@ -132,28 +143,42 @@ fn project_backward_cameras(
                     sums[13] += grad.camera.fy;
                     sums[14] += grad.camera.cx;
                     sums[15] += grad.camera.cy;
+                    if comptime!(model != CameraModel::Pinhole) {
+                        sums[16] += grad.camera.k.c0;
+                        sums[17] += grad.camera.k.c1;
+                        sums[18] += grad.camera.k.c2;
+                        sums[19] += grad.camera.k.c3;
+                    }
+                    if comptime!(model == CameraModel::OpenCv) {
+                        sums[20] += grad.camera.k.c4;
+                        sums[21] += grad.camera.k.c5;
+                        sums[22] += grad.camera.k.c6;
+                        sums[23] += grad.camera.k.c7;
+                    }
                 }
             }
         }
     }
     #[unroll]
-    for k in 0..CAMERA_VALUES {
+    for k in 0..values {
         shared[k * CUBE_UNITS_USIZE + unit] = sums[k];
     }
     sync_cube();
-    // 256 units: 16 values with 16 parts each, then 16 units add the parts.
+    // The units of a workgroup share the values, each value in equal parts; then one unit per value
+    // adds its parts.
     let mut part = 0.0f32;
-    for k in 0..16usize {
-        part += shared[unit * 16 + k];
+    for k in 0..values {
+        part += shared[unit * values + k];
     }
     parts[unit] = part;
     sync_cube();
-    if unit < CAMERA_VALUES && c < cameras as usize {
+    if unit < values && c < cameras as usize {
         let mut sum = 0.0f32;
-        for k in 0..16usize {
-            sum += parts[unit * 16 + k];
+        let share = comptime!(CUBE_UNITS_USIZE / camera_values(model));
+        for k in 0..share {
+            sum += parts[unit * share + k];
         }
-        partials[CUBE_POS * CAMERA_VALUES + unit] = sum;
+        partials[CUBE_POS * values + unit] = sum;
     }
 }
 
@@ -164,39 +189,49 @@ fn sum_camera_partials(
     partials: &[f32],
     grad_viewmats: &mut [f32],
     grad_intrinsics: &mut [f32],
+    grad_distortion: &mut [f32],
     cameras: u32,
     blocks: u32,
+    #[comptime] model: CameraModel,
     #[comptime] needs_grad: ProjectTensors<bool>,
 ) {
-    let c = ABSOLUTE_POS / CAMERA_VALUES;
-    let k = ABSOLUTE_POS % CAMERA_VALUES;
+    let values = comptime!(camera_values(model));
+    let coefficients = comptime!(model.coefficients());
+    let c = ABSOLUTE_POS / values;
+    let k = ABSOLUTE_POS % values;
     if c < cameras as usize {
         let mut sum = 0.0f32;
         for block in 0..blocks as usize {
-            sum += partials[(c * blocks as usize + block) * CAMERA_VALUES + k];
+            sum += partials[(c * blocks as usize + block) * values + k];
         }
         if k < 12 {
             if comptime!(needs_grad.viewmats) {
                 grad_viewmats[c * 16 + k] = sum;
             }
-        } else {
+        } else if k < 16 {
             if comptime!(needs_grad.viewmats) {
                 grad_viewmats[c * 16 + k] = 0.0f32;
             }
             if comptime!(needs_grad.intrinsics) {
                 grad_intrinsics[c * 4 + k - 12] = sum;
             }
+        } else if k < comptime!(16 + model.coefficients()) {
+            if comptime!(needs_grad.distortion) {
+                grad_distortion[c * coefficients + k - 16] = sum;
+            }
         }
     }
 }
 
-/// Gradients of means [N, 3], quats [N, 4], scales [N, 3], viewmats [C, 4, 4] and intrinsics [C,
-/// 4], from the gradient of the packed splats [C, N, 9]; only those that `needs_grad` names.
+/// Gradients of means [N, 3], quats [N, 4], scales [N, 3], viewmats [C, 4, 4], intrinsics [C, 4] and
+/// distortion [C, K], from the gradient of the packed splats [C, N, 9]; only those that `needs_grad`
+/// names.
 pub fn project_backward(
     client: &Client,
     inputs: &ProjectInputs,
     grad_packed: &Buffer,
     size: ImageSize,
+    model: CameraModel,
     settings: &ProjectSettings,
     needs_grad: ProjectTensors<bool>,
 ) -> ProjectTensors<Option<Buffer>> {
@@ -207,6 +242,12 @@ pub fn project_backward(
         scales: gaussians * 3,
         viewmats: cameras * 16,
         intrinsics: cameras * 4,
+        distortion: cameras * model.coefficients(),
+        domain: 0,
+    };
+    let needs_grad = ProjectTensors {
+        domain: false,
+        ..needs_grad
     };
     // A gradient that is not needed still needs a buffer to bind.
     let grads = lens
@@ -225,6 +266,8 @@ pub fn project_backward(
             inputs.scales.arg(),
             inputs.viewmats.arg(),
             inputs.intrinsics.arg(),
+            inputs.distortion.as_ref().map(Buffer::arg).into(),
+            inputs.domain.as_ref().map(Buffer::arg).into(),
             grad_packed.arg(),
             grads.means.arg(),
             grads.quats.arg(),
@@ -232,12 +275,15 @@ pub fn project_backward(
             gaussians as u32,
             cameras as u32,
             uniforms(size, settings),
+            model,
             needs_grad,
         );
     }
-    if (needs_grad.viewmats || needs_grad.intrinsics) && cameras > 0 {
+    let of_cameras = needs_grad.viewmats || needs_grad.intrinsics || needs_grad.distortion;
+    if of_cameras && cameras > 0 {
+        let values = camera_values(model);
         let blocks = gaussians.div_ceil(CAMERA_BLOCK);
-        let partials = Buffer::empty(client, cameras * blocks * CAMERA_VALUES);
+        let partials = Buffer::empty(client, cameras * blocks * values);
         if blocks > 0 {
             project_backward_cameras::launch(
                 client,
@@ -248,15 +294,18 @@ pub fn project_backward(
                 inputs.scales.arg(),
                 inputs.viewmats.arg(),
                 inputs.intrinsics.arg(),
+                inputs.distortion.as_ref().map(Buffer::arg).into(),
+                inputs.domain.as_ref().map(Buffer::arg).into(),
                 grad_packed.arg(),
                 partials.arg(),
                 gaussians as u32,
                 cameras as u32,
                 blocks as u32,
                 uniforms(size, settings),
+                model,
             );
         }
-        if let Some((count, dim)) = per_element(cameras * CAMERA_VALUES) {
+        if let Some((count, dim)) = per_element(cameras * values) {
             sum_camera_partials::launch(
                 client,
                 count,
@@ -264,8 +313,10 @@ pub fn project_backward(
                 partials.arg(),
                 grads.viewmats.arg(),
                 grads.intrinsics.arg(),
+                grads.distortion.arg(),
                 cameras as u32,
                 blocks as u32,
+                model,
                 needs_grad,
             );
         }

@@ -1,26 +1,51 @@
-//! One camera: its projection of a point, and the vector-Jacobian product of that. Another camera
-//! model replaces this file.
-//!
-//! ```text
-//! p = W mean + t = (x, y, z)                      mean2d = (fx x/z + cx, fy y/z + cy)
-//! u = clamp(x/z), v = clamp(y/z)                  J = [fx/z, 0, -fx u/z; 0, fy/z, -fy v/z]
-//! ```
+//! One camera: its projection of a point, and the vector-Jacobian product of that. The camera model
+//! is known when a kernel is compiled, so that a pinhole pays nothing for the others.
 
 use cubecl::prelude::*;
+use splat_core::CameraModel;
 
 use super::Uniforms;
+use super::distorted::{distorted_sight, distorted_vjp};
+use super::pinhole::{pinhole_sight, pinhole_vjp};
 use crate::math::{Mat3, Vec3};
 
-/// W, t and the intrinsics of one camera.
+/// W, t, the intrinsics and the lens of one camera.
 #[derive(CubeType, Clone, Copy)]
 #[expand(derive(Clone, Copy))]
 pub(super) struct Camera {
-    w: Mat3,
-    t: Vec3,
-    fx: f32,
-    fy: f32,
-    cx: f32,
-    cy: f32,
+    pub w: Mat3,
+    pub t: Vec3,
+    pub fx: f32,
+    pub fy: f32,
+    pub cx: f32,
+    pub cy: f32,
+    pub lens: Lens,
+}
+
+/// Coefficients and domain of a lens; zero, and read by nothing, for a pinhole.
+#[derive(CubeType, Clone, Copy)]
+#[expand(derive(Clone, Copy))]
+pub(super) struct Lens {
+    pub k: Coefficients,
+    /// Largest radius or angle.
+    pub limit: f32,
+    /// Radius of the clamp.
+    pub clamp: f32,
+}
+
+/// Coefficients of a lens in their order: k1, k2, p1, p2, k3, k4, k5, k6 of `opencv`, and k1, k2,
+/// k3, k4 of `opencv_fisheye`. Or their gradients.
+#[derive(CubeType, Clone, Copy)]
+#[expand(derive(Clone, Copy))]
+pub(super) struct Coefficients {
+    pub c0: f32,
+    pub c1: f32,
+    pub c2: f32,
+    pub c3: f32,
+    pub c4: f32,
+    pub c5: f32,
+    pub c6: f32,
+    pub c7: f32,
 }
 
 /// A point in a camera, with the camera linearised there.
@@ -31,11 +56,10 @@ pub(super) struct Sight {
     pub p: Vec3,
     pub mean_x: f32,
     pub mean_y: f32,
-    /// Clamped x/z and y/z, and whether they were inside the clamp.
-    u: f32,
-    v: f32,
-    u_inside: bool,
-    v_inside: bool,
+    /// By which splats are culled and sorted.
+    pub depth: f32,
+    /// True if the lens is defined there.
+    pub inside: bool,
     /// Rows of J W.
     pub jw1: Vec3,
     pub jw2: Vec3,
@@ -63,20 +87,68 @@ pub(super) struct CameraGradient {
     pub fy: f32,
     pub cx: f32,
     pub cy: f32,
+    pub k: Coefficients,
 }
 
-/// The clamp of x/z (or y/z): the image plus a margin on each side, relative to the actual
-/// principal point.
 #[cube]
-fn clamp_to_view(ratio: f32, focal: f32, centre: f32, size: f32, margin: f32) -> (f32, bool) {
-    let low = -(centre + margin * size) / focal;
-    let high = (size - centre + margin * size) / focal;
-    (max(low, min(ratio, high)), ratio >= low && ratio <= high)
+impl Coefficients {
+    /// All zero.
+    pub fn zero() -> Coefficients {
+        Coefficients {
+            c0: 0.0f32,
+            c1: 0.0f32,
+            c2: 0.0f32,
+            c3: 0.0f32,
+            c4: 0.0f32,
+            c5: 0.0f32,
+            c6: 0.0f32,
+            c7: 0.0f32,
+        }
+    }
+}
+
+#[cube]
+impl Lens {
+    fn load(
+        distortion: &ComptimeOption<&[f32]>,
+        domain: &ComptimeOption<&[f32]>,
+        index: usize,
+        #[comptime] model: CameraModel,
+    ) -> Lens {
+        let mut k = Coefficients::zero();
+        if let ComptimeOption::Some(distortion) = distortion {
+            let at = index * comptime!(model.coefficients());
+            k.c0 = distortion[at];
+            k.c1 = distortion[at + 1];
+            k.c2 = distortion[at + 2];
+            k.c3 = distortion[at + 3];
+            if comptime!(model.coefficients() > 4) {
+                k.c4 = distortion[at + 4];
+                k.c5 = distortion[at + 5];
+                k.c6 = distortion[at + 6];
+                k.c7 = distortion[at + 7];
+            }
+        }
+        let mut limit = 0.0f32;
+        let mut clamp = 0.0f32;
+        if let ComptimeOption::Some(domain) = domain {
+            limit = domain[index * 2];
+            clamp = domain[index * 2 + 1];
+        }
+        Lens { k, limit, clamp }
+    }
 }
 
 #[cube]
 impl Camera {
-    pub fn load(viewmats: &[f32], intrinsics: &[f32], index: usize) -> Camera {
+    pub fn load(
+        viewmats: &[f32],
+        intrinsics: &[f32],
+        distortion: &ComptimeOption<&[f32]>,
+        domain: &ComptimeOption<&[f32]>,
+        index: usize,
+        #[comptime] model: CameraModel,
+    ) -> Camera {
         let m = index * 16;
         let i = index * 4;
         Camera {
@@ -90,70 +162,32 @@ impl Camera {
             fy: intrinsics[i + 1],
             cx: intrinsics[i + 2],
             cy: intrinsics[i + 3],
+            lens: Lens::load(distortion, domain, index, model),
         }
     }
 
-    pub fn sight(self, mean: Vec3, s: Uniforms) -> Sight {
+    pub fn sight(self, mean: Vec3, s: Uniforms, #[comptime] model: CameraModel) -> Sight {
         let p = self.w.mul_vec(mean).add(self.t);
-        let mean_x = self.fx * p.x / p.z + self.cx;
-        let mean_y = self.fy * p.y / p.z + self.cy;
-
-        let (u, u_inside) = clamp_to_view(p.x / p.z, self.fx, self.cx, s.width, s.clamp_margin);
-        let (v, v_inside) = clamp_to_view(p.y / p.z, self.fy, self.cy, s.height, s.clamp_margin);
-
-        // J W = [fx/z (W1 - u W3); fy/z (W2 - v W3)]
-        let jw1 = self.w.r0.sub(self.w.r2.scale(u)).scale(self.fx / p.z);
-        let jw2 = self.w.r1.sub(self.w.r2.scale(v)).scale(self.fy / p.z);
-        Sight {
-            p,
-            mean_x,
-            mean_y,
-            u,
-            v,
-            u_inside,
-            v_inside,
-            jw1,
-            jw2,
+        if comptime!(model == CameraModel::Pinhole) {
+            pinhole_sight(self, p, s)
+        } else {
+            distorted_sight(self, p, model)
         }
     }
 
     /// Vector-Jacobian product of [`Camera::sight`] at `mean`.
-    pub fn sight_vjp(self, mean: Vec3, sight: Sight, g: SightGradient) -> CameraGradient {
-        let Sight { p, u, v, .. } = sight;
-        // J W = [fx/z (W1 - u W3); fy/z (W2 - v W3)]
-        let w = self.w;
-        let j1 = self.fx / p.z;
-        let j2 = self.fy / p.z;
-        let g_j1 = g.jw1.dot(w.r0.sub(w.r2.scale(u)));
-        let g_j2 = g.jw2.dot(w.r1.sub(w.r2.scale(v)));
-        let g_u = -j1 * g.jw1.dot(w.r2);
-        let g_v = -j2 * g.jw2.dot(w.r2);
-        // Inside, u = x/z. Outside, u = constant/fx - cx/fx.
-        let g_u_inside = select(sight.u_inside, g_u, 0.0f32);
-        let g_v_inside = select(sight.v_inside, g_v, 0.0f32);
-        let g_u_held = g_u - g_u_inside;
-        let g_v_held = g_v - g_v_inside;
-
-        // mean2d = (fx x/z + cx, fy y/z + cy)
-        let g_ratio_x = g_u_inside + g.mean_x * self.fx;
-        let g_ratio_y = g_v_inside + g.mean_y * self.fy;
-        let along = g_ratio_x * (p.x / p.z) + g_ratio_y * (p.y / p.z) + g_j1 * j1 + g_j2 * j2;
-        let g_p = Vec3::new(g_ratio_x / p.z, g_ratio_y / p.z, g.depth - along / p.z);
-        CameraGradient {
-            mean: w.transpose_mul_vec(g_p),
-            w: Mat3 {
-                r0: g.jw1.scale(j1).add(mean.scale(g_p.x)),
-                r1: g.jw2.scale(j2).add(mean.scale(g_p.y)),
-                r2: mean
-                    .scale(g_p.z)
-                    .sub(g.jw1.scale(j1 * u))
-                    .sub(g.jw2.scale(j2 * v)),
-            },
-            t: g_p,
-            fx: g.mean_x * (p.x / p.z) + g_j1 / p.z - g_u_held * u / self.fx,
-            fy: g.mean_y * (p.y / p.z) + g_j2 / p.z - g_v_held * v / self.fy,
-            cx: g.mean_x - g_u_held / self.fx,
-            cy: g.mean_y - g_v_held / self.fy,
+    pub fn sight_vjp(
+        self,
+        mean: Vec3,
+        sight: Sight,
+        g: SightGradient,
+        s: Uniforms,
+        #[comptime] model: CameraModel,
+    ) -> CameraGradient {
+        if comptime!(model == CameraModel::Pinhole) {
+            pinhole_vjp(self, mean, sight, g, s)
+        } else {
+            distorted_vjp(self, mean, sight, g, model)
         }
     }
 }

@@ -1,7 +1,7 @@
 //! One Gaussian projected to one camera.
 
 use cubecl::prelude::*;
-use splat_core::SPLAT_SIZE_MAX;
+use splat_core::{CameraModel, SPLAT_SIZE_MAX};
 
 use super::Uniforms;
 use super::camera::{Camera, Sight};
@@ -118,8 +118,13 @@ pub(super) struct Splat {
 }
 
 #[cube]
-pub(super) fn project_splat(g: Gaussian, camera: Camera, s: Uniforms) -> Splat {
-    let sight = camera.sight(g.mean, s);
+pub(super) fn project_splat(
+    g: Gaussian,
+    camera: Camera,
+    s: Uniforms,
+    #[comptime] model: CameraModel,
+) -> Splat {
+    let sight = camera.sight(g.mean, s, model);
     let q = g.quat.normalize();
     let r = q.to_matrix();
     let jwr1 = r.transpose_mul_vec(sight.jw1);
@@ -139,7 +144,12 @@ pub(super) fn project_splat(g: Gaussian, camera: Camera, s: Uniforms) -> Splat {
 
     // Written so that NaN fails; a non-finite input shows in one of these values.
     let Sight {
-        p, mean_x, mean_y, ..
+        p,
+        mean_x,
+        mean_y,
+        depth,
+        inside,
+        ..
     } = sight;
     let finite = p.is_finite()
         && is_finite(mean_x)
@@ -151,14 +161,14 @@ pub(super) fn project_splat(g: Gaussian, camera: Camera, s: Uniforms) -> Splat {
         && is_finite(compensation)
         && is_finite(extent_x)
         && is_finite(extent_y);
-    let in_depth = s.near <= p.z && p.z <= s.far;
+    let in_depth = s.near <= depth && depth <= s.far;
     // Strict comparison, as `splat_core` defines culling.
     let on_screen = mean_x + extent_x > 0.0f32
         && mean_x - extent_x < s.width
         && mean_y + extent_y > 0.0f32
         && mean_y - extent_y < s.height;
     Splat {
-        visible: finite && in_depth && on_screen && g.quat.max_abs() > 0.0f32,
+        visible: finite && in_depth && inside && on_screen && g.quat.max_abs() > 0.0f32,
         sight,
         q,
         r,

@@ -1,7 +1,9 @@
 //! The vector-Jacobian product of the projection of one Gaussian to one camera.
 
 use cubecl::prelude::*;
+use splat_core::CameraModel;
 
+use super::Uniforms;
 use super::camera::{Camera, CameraGradient, SightGradient};
 use super::splat::{Covariance, Gaussian, Splat};
 use crate::math::{Mat3, Quat, Vec3};
@@ -69,6 +71,8 @@ pub(super) fn project_vjp(
     splat: Splat,
     grad_packed: &[f32],
     at: usize,
+    s: Uniforms,
+    #[comptime] model: CameraModel,
 ) -> Gradient {
     let (g_v1, g_v2) = covariance_vjp(splat, grad_packed, at);
     let Splat { sight, q, r, .. } = splat;
@@ -91,7 +95,7 @@ pub(super) fn project_vjp(
         jw2: r.mul_vec(g_jwr2),
     };
     Gradient {
-        camera: camera.sight_vjp(g.mean, sight, g_sight),
+        camera: camera.sight_vjp(g.mean, sight, g_sight, s, model),
         quat: g_quat,
         scale: g_scale,
     }

@@ -1,6 +1,6 @@
 //! Tests of projection and its gradients.
 
-use splat_core::{ImageSize, ProjectSettings};
+use splat_core::{CameraModel, ImageSize, ProjectSettings, ProjectTensors};
 use splat_kernels::project::{ProjectInputs, project, project_backward};
 
 use crate::device::{assert_close, client, differences, download, rng, uniform, upload, wide};
@@ -63,6 +63,18 @@ fn reference_all(p: &[Vec<f64>; 5]) -> Vec<f64> {
     packed
 }
 
+/// Which of the first five gradients are needed.
+fn needed([means, quats, scales, viewmats, intrinsics]: [bool; 5]) -> ProjectTensors<bool> {
+    ProjectTensors {
+        means,
+        quats,
+        scales,
+        viewmats,
+        intrinsics,
+        ..ProjectTensors::default()
+    }
+}
+
 fn inputs(client: &cubecl::client::Client, scene: &[Vec<f32>; 5]) -> ProjectInputs {
     ProjectInputs {
         means: upload(client, &scene[0]),
@@ -70,6 +82,8 @@ fn inputs(client: &cubecl::client::Client, scene: &[Vec<f32>; 5]) -> ProjectInpu
         scales: upload(client, &scene[2]),
         viewmats: upload(client, &scene[3]),
         intrinsics: upload(client, &scene[4]),
+        distortion: None,
+        domain: None,
     }
 }
 
@@ -80,7 +94,10 @@ fn projection_and_all_its_gradients_agree_with_float64() {
     let inputs = inputs(&client, &scene);
     let wide_scene = scene.each_ref().map(|v| wide(v));
     let expected = reference_all(&wide_scene);
-    let packed = download(&client, &project(&client, &inputs, SIZE, &settings()));
+    let packed = download(
+        &client,
+        &project(&client, &inputs, SIZE, CameraModel::Pinhole, &settings()),
+    );
     let visible = |rows: &[f64]| rows.chunks(9).filter(|row| row[7] > 0.0).count();
     assert!(
         visible(&expected) > 100 && visible(&expected) < 500,
@@ -101,18 +118,19 @@ fn projection_and_all_its_gradients_agree_with_float64() {
         row[7] = 0.0;
         row[8] = 0.0;
     }
-    let grads: [_; 5] = project_backward(
+    let grads: [_; 7] = project_backward(
         &client,
         &inputs,
         &upload(&client, &weights),
         SIZE,
+        CameraModel::Pinhole,
         &settings(),
-        [true; 5].into(),
+        needed([true; 5]),
     )
     .into();
     let weights = wide(&weights);
     let names = ["means", "quats", "scales", "viewmats", "intrinsics"];
-    for (which, grad) in grads.iter().enumerate() {
+    for (which, grad) in grads[..5].iter().enumerate() {
         let grad = download(&client, grad.as_ref().expect("wanted"));
         let expected = differences(&wide_scene[which], 1e-6, |x| {
             let mut moved = wide_scene.clone();
@@ -133,15 +151,31 @@ fn only_the_wanted_gradients_are_returned() {
     let scene = scene(10);
     let inputs = inputs(&client, &scene);
     let grad = upload(&client, &[1.0; 2 * 10 * 9]);
-    let all: [_; 5] =
-        project_backward(&client, &inputs, &grad, SIZE, &settings(), [true; 5].into()).into();
+    let all: [_; 7] = project_backward(
+        &client,
+        &inputs,
+        &grad,
+        SIZE,
+        CameraModel::Pinhole,
+        &settings(),
+        needed([true; 5]),
+    )
+    .into();
     for wanted in [
         [true, false, false, false, false],
         [false, true, true, false, true],
         [false, false, false, true, false],
     ] {
-        let some: [_; 5] =
-            project_backward(&client, &inputs, &grad, SIZE, &settings(), wanted.into()).into();
+        let some: [_; 7] = project_backward(
+            &client,
+            &inputs,
+            &grad,
+            SIZE,
+            CameraModel::Pinhole,
+            &settings(),
+            needed(wanted),
+        )
+        .into();
         for i in 0..5 {
             assert_eq!(some[i].is_some(), wanted[i]);
             if let (Some(some), Some(all)) = (&some[i], &all[i]) {
@@ -184,14 +218,25 @@ fn bad_gaussians_are_culled_and_their_gradients_are_zero() {
         intrinsics[..4].to_vec(),
     ];
     let inputs = inputs(&client, &scene);
-    let packed = download(&client, &project(&client, &inputs, SIZE, &settings()));
+    let packed = download(
+        &client,
+        &project(&client, &inputs, SIZE, CameraModel::Pinhole, &settings()),
+    );
     for (case, row) in cases.iter().zip(packed.chunks(9)) {
         assert_eq!(row, [0.0; 9], "{}", case.0);
     }
     let grad = upload(&client, &vec![1.0; packed.len()]);
-    let grads = project_backward(&client, &inputs, &grad, SIZE, &settings(), [true; 5].into());
-    for grad in <[_; 5]>::from(grads) {
-        assert!(download(&client, &grad.unwrap()).iter().all(|v| *v == 0.0));
+    let grads = project_backward(
+        &client,
+        &inputs,
+        &grad,
+        SIZE,
+        CameraModel::Pinhole,
+        &settings(),
+        needed([true; 5]),
+    );
+    for grad in <[_; 7]>::from(grads).into_iter().flatten() {
+        assert!(download(&client, &grad).iter().all(|v| *v == 0.0));
     }
 }
 
@@ -212,20 +257,24 @@ fn the_length_of_a_quaternion_does_not_matter() {
         intrinsics[..4].to_vec(),
     ];
     let inputs = inputs(&client, &scene);
-    let packed = download(&client, &project(&client, &inputs, SIZE, &settings()));
+    let packed = download(
+        &client,
+        &project(&client, &inputs, SIZE, CameraModel::Pinhole, &settings()),
+    );
     assert!(packed[7] > 0.0);
     for row in packed.chunks(9) {
         assert_close("row", row, &wide(&packed[..9]), 1e-6);
     }
     // The gradient is orthogonal to the quaternion.
     let grad = upload(&client, &uniform(&mut rng(8), packed.len(), -1.0, 1.0));
-    let [_, grad, ..]: [_; 5] = project_backward(
+    let [_, grad, ..]: [_; 7] = project_backward(
         &client,
         &inputs,
         &grad,
         SIZE,
+        CameraModel::Pinhole,
         &settings(),
-        [false, true, false, false, false].into(),
+        needed([false, true, false, false, false]),
     )
     .into();
     for (q, g) in wide(&scene[1])
@@ -259,7 +308,13 @@ fn needles_keep_their_determinant() {
     ];
     let packed = download(
         &client,
-        &project(&client, &inputs(&client, &scene), SIZE, &settings()),
+        &project(
+            &client,
+            &inputs(&client, &scene),
+            SIZE,
+            CameraModel::Pinhole,
+            &settings(),
+        ),
     );
     let expected = reference_all(&scene.each_ref().map(|v| wide(v)));
     for k in [3, 4, 5] {
@@ -276,17 +331,21 @@ fn no_gaussians_project_to_nothing() {
     let [_, _, _, viewmats, intrinsics] = scene(1);
     let scene = [vec![], vec![], vec![], viewmats, intrinsics];
     let inputs = inputs(&client, &scene);
-    assert!(project(&client, &inputs, SIZE, &settings()).is_empty());
-    let grads: [_; 5] = project_backward(
+    assert!(project(&client, &inputs, SIZE, CameraModel::Pinhole, &settings()).is_empty());
+    let grads: [_; 7] = project_backward(
         &client,
         &inputs,
         &upload(&client, &[]),
         SIZE,
+        CameraModel::Pinhole,
         &settings(),
-        [true; 5].into(),
+        needed([true; 5]),
     )
     .into();
-    let grads = grads.map(|grad| download(&client, &grad.unwrap()));
+    let grads = grads.map(|grad| {
+        grad.map(|grad| download(&client, &grad))
+            .unwrap_or_default()
+    });
     assert!(grads[..3].iter().all(Vec::is_empty));
     assert_eq!(grads[3], [0.0; 32]);
     assert_eq!(grads[4], [0.0; 8]);

@@ -10,7 +10,7 @@ use crate::report::metrics::write_json;
 use crate::report::probe_files;
 use splat_lab::accuracy::report::{Backend, Report};
 
-/// The 38 hard cases: error of image and gradients, and time
+/// The 44 hard cases: error of image and gradients, and time
 #[derive(Debug, Args)]
 #[command(after_help = "Examples:
   splat bench accuracy

@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use super::scene::middle;
 use super::{bounds, bounds_text};
-use splat_data::Capture;
+use splat_data::{Capture, Lens};
 
 /// Describes the capture.
 pub(super) fn describe(capture: &Capture) -> String {
@@ -19,15 +19,33 @@ pub(super) fn describe(capture: &Capture) -> String {
     for (width, height, count) in capture.image_sizes() {
         let _ = writeln!(text, "  {width} x {height} px: {count}");
     }
-    let mut cameras: Vec<[f64; 4]> = Vec::new();
+    let mut cameras: Vec<([f64; 4], Lens)> = Vec::new();
     for view in &capture.views {
-        if !cameras.contains(&view.intrinsics) {
-            cameras.push(view.intrinsics);
+        let camera = (view.intrinsics, view.lens);
+        if !cameras.contains(&camera) {
+            cameras.push(camera);
         }
     }
-    let _ = writeln!(text, "cameras  {} (pinhole)", cameras.len());
-    for [fx, fy, cx, cy] in cameras.iter().take(8) {
-        let _ = writeln!(text, "  fx {fx:.3}  fy {fy:.3}  cx {cx:.3}  cy {cy:.3}");
+    let _ = writeln!(text, "cameras  {}", cameras.len());
+    for ([fx, fy, cx, cy], lens) in cameras.iter().take(8) {
+        let model = lens.model();
+        let _ = write!(
+            text,
+            "  {}  fx {fx:.3}  fy {fy:.3}  cx {cx:.3}  cy {cy:.3}",
+            model.name()
+        );
+        for (name, value) in model.coefficient_names().iter().zip(lens.coefficients()) {
+            let _ = write!(text, "  {name} {value:.5}");
+        }
+        text.push('\n');
+    }
+    let masks = capture
+        .views
+        .iter()
+        .filter(|view| view.mask.is_some())
+        .count();
+    if masks > 0 {
+        let _ = writeln!(text, "masks  {masks}");
     }
     if cameras.len() > 8 {
         let _ = writeln!(text, "  and {} more", cameras.len() - 8);

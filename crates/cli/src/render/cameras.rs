@@ -10,7 +10,7 @@ use splat_model::Camera;
 use splat_model::ops::ImageSize;
 
 use super::super::{Failure, text};
-use splat_data::{Capture, Lens, View};
+use splat_data::{CameraModel, Capture, Lens, View};
 
 /// Largest side in pixels: a picture of this size takes about 3 GB while rendering.
 const MOST_PIXELS: u32 = 16_384;
@@ -36,6 +36,9 @@ struct FileCamera {
     height: u32,
     intrinsics: [f64; 4],
     viewmat: [[f64; 4]; 4],
+    camera_model: Option<String>,
+    #[serde(default)]
+    distortion: Vec<f64>,
 }
 
 /// Cameras of a file, by their names or their index.
@@ -69,27 +72,50 @@ fn of_text(text: &str) -> Result<Vec<(String, Camera)>, String> {
 }
 
 impl FileCamera {
-    fn checked(self) -> Result<Camera, &'static str> {
+    /// The lens: a pinhole unless the file names another camera model.
+    fn lens(&self) -> Result<Lens, String> {
+        let name = self.camera_model.as_deref().unwrap_or("pinhole");
+        let Some(model) = CameraModel::of_name(name) else {
+            let known = CameraModel::ALL.map(CameraModel::name).join(", ");
+            return Err(format!("camera_model `{name}` is none of {known}"));
+        };
+        let finite = self.distortion.iter().all(|k| k.is_finite());
+        let lens = Lens::new(model, &self.distortion).filter(|_| finite);
+        lens.ok_or_else(|| match model {
+            CameraModel::Pinhole => {
+                "distortion needs a camera_model: opencv or opencv_fisheye".to_owned()
+            }
+            _ => format!(
+                "distortion of `{name}` must be {} finite numbers: {}",
+                model.coefficients(),
+                model.coefficient_names().join(", ")
+            ),
+        })
+    }
+
+    fn checked(self) -> Result<Camera, String> {
         let sides = [self.width, self.height];
         if !sides.iter().all(|side| (1..=MOST_PIXELS).contains(side)) {
-            return Err("width and height must be 1 to 16384");
+            return Err("width and height must be 1 to 16384".to_owned());
         }
         let [fx, fy, ..] = self.intrinsics;
         if !(self.intrinsics.iter().all(|x| x.is_finite()) && fx > 0.0 && fy > 0.0) {
-            return Err("intrinsics must be finite, fx and fy positive");
+            return Err("intrinsics must be finite, fx and fy positive".to_owned());
         }
+        let lens = self.lens()?;
         let viewmat = DMat4::from_cols_array_2d(&self.viewmat).transpose();
         let rotation = DMat3::from_mat4(viewmat);
         let error = rotation * rotation.transpose() - DMat3::IDENTITY;
         let is_rotation =
             error.to_cols_array().iter().all(|e| e.abs() <= 1e-4) && rotation.determinant() > 0.0;
         if !(is_rotation && viewmat.is_finite() && self.viewmat[3] == [0.0, 0.0, 0.0, 1.0]) {
-            return Err("viewmat must be a rotation and a translation, its last row 0 0 0 1");
+            let what = "viewmat must be a rotation and a translation, its last row 0 0 0 1";
+            return Err(what.to_owned());
         }
         Ok(Camera {
             viewmat,
             intrinsics: self.intrinsics,
-            lens: Lens::Pinhole,
+            lens,
             size: ImageSize {
                 width: self.width,
                 height: self.height,
@@ -187,6 +213,24 @@ mod tests {
         assert_eq!(read(&format!("[{good}, {good}]")).unwrap().len(), 2);
         // Some editors start a text with this.
         assert_eq!(read(&format!("\u{FEFF}{good}")).unwrap().len(), 1);
+        let bent = |camera: &str| good.replacen("\"width\"", &format!("{camera}, \"width\""), 1);
+        let fisheye = r#""camera_model": "opencv_fisheye", "distortion": [0.1, 0, 0, 0]"#;
+        let cameras = read(&bent(fisheye)).unwrap();
+        assert_eq!(cameras[0].1.lens, Lens::OpenCvFisheye([0.1, 0.0, 0.0, 0.0]));
+        for (camera, reason) in [
+            (
+                r#""camera_model": "fov""#,
+                "`fov` is none of pinhole, opencv",
+            ),
+            (r#""distortion": [0.1]"#, "needs a camera_model"),
+            (
+                r#""camera_model": "opencv", "distortion": [1]"#,
+                "must be 8 finite numbers: k1",
+            ),
+        ] {
+            let message = read(&bent(camera)).unwrap_err().to_string();
+            assert!(message.contains(reason), "{message}");
+        }
         for (from, to) in [
             ("64", "0"),
             ("48", "99999"),

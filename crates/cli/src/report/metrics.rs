@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::{ReportError, write};
 use splat_trainer::Scores;
+use splat_trainer::calibration::AlignedScores;
 
 /// Contents of `metrics.json`, in the order of its fields.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -14,6 +15,10 @@ pub struct Metrics {
     /// view) and infinite ones (the PSNR of a perfect copy) are `null`.
     #[serde(flatten)]
     pub scores: Scores,
+    /// The same with the poses of the held-out views aligned with the scene first; absent unless
+    /// the run refined poses.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub aligned: Option<AlignedScores>,
     /// Number of Gaussians.
     pub gaussians: usize,
     /// Number of steps trained.

@@ -21,8 +21,9 @@ use crate::report::view_names::ViewNames;
 use crate::report::{ReportError, probe_file, probe_folder, refuse_inputs, write_durably};
 use splat_data::{Capture, View, WriteError};
 use splat_lab::memory::peak_rss_bytes;
+use splat_trainer::Scores;
+use splat_trainer::calibration::AlignedScores;
 use splat_trainer::{CheckpointError, History, TrainSettings, Trained};
-use splat_trainer::{Scores, evaluate};
 
 /// The scene's file.
 pub(super) const SCENE: &str = "scene.ply";
@@ -34,6 +35,8 @@ pub(super) const CONFIG: &str = "config.toml";
 pub(super) const METRICS: &str = "metrics.json";
 const LOSSES: &str = "losses.csv";
 const CURVES: &str = "curves.svg";
+/// The folder of refined cameras, a COLMAP model.
+pub(super) const CAMERAS: &str = "cameras";
 /// The pictures' folder.
 const VIEWS: &str = "views";
 
@@ -118,7 +121,7 @@ impl RunFolder<'_> {
         self.outcome(saving)
     }
 
-    /// Saves a complete run, measures it, and removes its checkpoint. Returns the scores, if they
+    /// Saves a complete run, measures it, and removes its checkpoint. Returns the figures, if they
     /// could be measured, and whether everything could be saved.
     pub(super) fn complete(
         &self,
@@ -126,7 +129,7 @@ impl RunFolder<'_> {
         capture: &Capture,
         config: &TrainSettings,
         chosen: &ChosenDevice,
-    ) -> (Option<Scores>, Result<(), Failure>) {
+    ) -> (Option<Metrics>, Result<(), Failure>) {
         let mut saving = Saving::default();
         let scene = self.save_scene(&mut saving, trained);
         if !scene && self.folder.join(SCENE).exists() {
@@ -136,15 +139,19 @@ impl RunFolder<'_> {
         }
         self.save_course(&mut saving, trained, scene);
         let scores = self.save_views(&mut saving, trained, capture, chosen);
-        if let Some(scores) = &scores {
-            let metrics = metrics(scores, trained, config, chosen);
-            saving.keep(METRICS, write_json(&self.folder.join(METRICS), &metrics));
+        let aligned = self.save_cameras(&mut saving, trained, capture, config, chosen);
+        let metrics = scores.map(|scores| Metrics {
+            aligned,
+            ..metrics(&scores, trained, config, chosen)
+        });
+        if let Some(metrics) = &metrics {
+            saving.keep(METRICS, write_json(&self.folder.join(METRICS), metrics));
         }
         if saving.failed.is_empty() {
-            return (scores, self.remove_checkpoint());
+            return (metrics, self.remove_checkpoint());
         }
         saving.keep(CHECKPOINT, self.save_checkpoint(trained));
-        (scores, self.outcome(saving))
+        (metrics, self.outcome(saving))
     }
 
     /// Saves the scene. Figures of an earlier scene are removed.
@@ -209,8 +216,7 @@ impl RunFolder<'_> {
                 Err(_) => {}
             }
         };
-        let settings = &trained.render_settings;
-        let scores = evaluate(&trained.model, &views, settings, &chosen.device, keep);
+        let scores = trained.evaluate(&views, &chosen.device, keep);
         if !views.is_empty() {
             saving.keep(VIEWS, written);
         }
@@ -222,6 +228,52 @@ impl RunFolder<'_> {
                 None
             }
         }
+    }
+
+    /// Saves the cameras that the run has refined, with the held-out views aligned with the scene,
+    /// and returns their scores.
+    fn save_cameras(
+        &self,
+        saving: &mut Saving,
+        trained: &Trained,
+        capture: &Capture,
+        config: &TrainSettings,
+        chosen: &ChosenDevice,
+    ) -> Option<AlignedScores> {
+        let calibration = &config.calibration;
+        if !calibration.is_on() {
+            return None;
+        }
+        let measure = || -> Result<(Vec<View>, Option<AlignedScores>), Failure> {
+            let cameras = trained.cameras(capture)?;
+            let refined = capture.views.iter().zip(&cameras);
+            let mut refined: Vec<View> = refined
+                .map(|(view, camera)| view.with_camera(camera))
+                .collect();
+            if !calibration.poses || capture.split.test.is_empty() {
+                return Ok((refined, None));
+            }
+            let views: Vec<&View> = capture.test_views().collect();
+            let steps = calibration.align_steps;
+            let aligned = trained.evaluate_aligned(&views, &chosen.device, steps)?;
+            for (index, camera) in capture.split.test.iter().zip(&aligned.cameras) {
+                refined[*index] = refined[*index].with_pose(camera);
+            }
+            Ok((refined, Some(aligned)))
+        };
+        let (views, aligned) = match measure() {
+            Ok(measured) => measured,
+            Err(error) => {
+                saving.keep(CAMERAS, Err(error));
+                return None;
+            }
+        };
+        let refined = Capture {
+            views,
+            ..capture.clone()
+        };
+        saving.keep(CAMERAS, refined.save_model(&self.folder.join(CAMERAS)));
+        aligned
     }
 
     /// Reports pictures that do not belong to this scene. They may be the user's and are kept.
@@ -288,6 +340,7 @@ fn metrics(
             .map(|usage| usage.bytes_reserved),
         device: chosen.name.clone(),
         seed: config.seed,
+        aligned: None,
     }
 }
 

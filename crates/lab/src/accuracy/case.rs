@@ -8,7 +8,7 @@ use crate::gradcheck::Scene;
 /// A scene, or another task, that breaks naive splatting code.
 #[derive(Clone, Copy)]
 pub struct Case {
-    /// 1 to 38.
+    /// 1 to 44.
     pub number: u8,
     /// Short description.
     pub name: &'static str,

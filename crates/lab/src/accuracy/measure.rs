@@ -164,6 +164,7 @@ fn group<'a>(inputs: &'a mut Inputs, name: &str) -> Option<&'a mut Array> {
         "viewmat" => &mut inputs.viewmat,
         "intrinsics" => &mut inputs.intrinsics,
         "background" => &mut inputs.background,
+        "distortion" => inputs.distortion.as_mut()?,
         _ => return None,
     })
 }
@@ -182,6 +183,7 @@ pub(super) fn gradients(computed: &Computed) -> Vec<f64> {
         &g.background,
     ]
     .into_iter()
+    .chain(&g.distortion)
     .flat_map(|array| array.values.iter().copied())
     .collect()
 }

@@ -106,7 +106,7 @@ impl Seen {
             whiten,
             mean: whiten * mean,
             through_mean: (whiten * mean.normalize()).length_squared(),
-            depth: mean.z,
+            depth: camera.lens.depth(mean.to_array()),
             opacity: gaussian.opacity,
             color: gaussian.color,
         }
@@ -124,7 +124,7 @@ impl Seen {
 
 /// Renders by integrating every Gaussian along every pixel's ray.
 ///
-/// Gaussians nearer than `near` or farther than `far` (camera z of the mean), and those with a
+/// Gaussians nearer than `near` or farther than `far` (depth of the mean), and those with a
 /// non-finite field or a scale of zero, are not drawn.
 pub fn render_rays(
     gaussians: &[Gaussian3d],
@@ -141,13 +141,22 @@ pub fn render_rays(
     seen.sort_by(|a, b| a.depth.total_cmp(&b.depth)); // stable: ties by index
     let [fx, fy, cx, cy] = camera.intrinsics;
     let width = camera.size.width as usize;
+    let lens = camera.lens.bounded();
     let pixels: Vec<(DVec3, f64)> = (0..width * camera.size.height as usize)
         .into_par_iter()
         .map(|pixel| {
             let x = (pixel % width) as f64 + 0.5;
             let y = (pixel / width) as f64 + 0.5;
-            let direction = DVec3::new((x - cx) / fx, (y - cy) / fy, 1.0).normalize();
-            blend(&seen, direction, background, rasterize)
+            // Beyond the lens's domain is the background.
+            let direction = lens.undistort([(x - cx) / fx, (y - cy) / fy]);
+            direction.map_or((background, 0.0), |direction| {
+                blend(
+                    &seen,
+                    DVec3::from(direction).normalize(),
+                    background,
+                    rasterize,
+                )
+            })
         })
         .collect();
     let (image, alpha) = pixels.into_iter().unzip();
@@ -210,7 +219,20 @@ pub fn render_affine(
     };
     let viewmat = camera.viewmat.transpose().to_cols_array().to_vec();
     let viewmat = TensorData::new(viewmat, [1, 4, 4]);
-    let intrinsics = TensorData::new(camera.intrinsics.to_vec(), [1, 4]);
+    let row = |values: &[f64]| {
+        let data = TensorData::new(values.to_vec(), [1, values.len()]);
+        Tensor::<2>::from_data(data, (device, DType::F64))
+    };
+    let pinhole = row(&camera.intrinsics);
+    let lens = camera.lens;
+    let distortion = (lens.model() != CameraModel::Pinhole).then(|| {
+        let domain = lens.domain(camera.intrinsics, camera.size);
+        Distortion {
+            model: lens.model(),
+            coefficients: row(lens.coefficients()),
+            domain: row(&[domain.limit, domain.clamp]),
+        }
+    });
     let opacities: Vec<f64> = gaussians.iter().map(|g| g.opacity).collect();
     let projected = project(
         upload(columns(&|g| g.mean.to_array().to_vec()), 3),
@@ -220,7 +242,10 @@ pub fn render_affine(
         ),
         upload(columns(&|g| g.scale.to_array().to_vec()), 3),
         Tensor::from_data(viewmat, (device, DType::F64)),
-        Tensor::from_data(intrinsics, (device, DType::F64)),
+        Intrinsics {
+            pinhole,
+            distortion,
+        },
         camera.size,
         project_settings,
     )?;

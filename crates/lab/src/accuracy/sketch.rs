@@ -3,7 +3,7 @@
 use glam::{DMat3, DMat4, DQuat, DVec3};
 use rand::{RngExt, SeedableRng};
 use rand_pcg::Pcg64Mcg;
-use splat_ops::{ImageSize, ProjectSettings, RasterizeSettings};
+use splat_ops::{ImageSize, Lens, ProjectSettings, RasterizeSettings};
 
 use crate::gradcheck::{Array, Inputs, Outputs, Scene};
 
@@ -24,12 +24,14 @@ pub(crate) struct Blob {
     pub sh: [[f64; 3]; 16],
 }
 
-/// A scene under construction: a pinhole camera with splats in front of it.
+/// A scene under construction: a camera with splats in front of it.
 pub(crate) struct Sketch {
     pub name: &'static str,
     pub size: ImageSize,
     /// fx, fy, cx, cy.
     pub intrinsics: [f64; 4],
+    /// A pinhole unless set, before splats are placed.
+    pub lens: Lens,
     pub viewmat: DMat4,
     pub sh_degree: usize,
     pub antialias: bool,
@@ -55,6 +57,7 @@ impl Sketch {
                 f64::from(width) / 2.0,
                 f64::from(height) / 2.0,
             ],
+            lens: Lens::Pinhole,
             viewmat: DMat4::IDENTITY,
             sh_degree: 1,
             antialias: false,
@@ -84,10 +87,18 @@ impl Sketch {
         self.rng.random_range(low..high)
     }
 
-    /// The world point seen at `pixel` and camera depth `depth`.
+    /// The world point seen at `pixel` and depth `depth`.
+    ///
+    /// # Panics
+    /// When the lens sees nothing at that pixel.
     pub fn at(&self, pixel: [f64; 2], depth: f64) -> DVec3 {
         let [fx, fy, cx, cy] = self.intrinsics;
-        let seen = DVec3::new((pixel[0] - cx) / fx, (pixel[1] - cy) / fy, 1.0) * depth;
+        let point = [(pixel[0] - cx) / fx, (pixel[1] - cy) / fy];
+        let direction = self
+            .lens
+            .undistort(point)
+            .expect("a pixel inside of the lens's domain");
+        let seen = DVec3::from(direction) * depth;
         self.viewmat.inverse().transform_point3(seen)
     }
 
@@ -179,13 +190,16 @@ impl Sketch {
             values: values.into_iter().map(rounded).collect(),
         };
         let rows = self.viewmat.transpose().to_cols_array();
-        Scene {
+        let distortion = self.lens.coefficients().to_vec();
+        let mut scene = Scene {
             source: self.name.into(),
             cameras: 1,
             gaussians: n,
             size: self.size,
             sh_degree: self.sh_degree,
             antialias: self.antialias,
+            model: self.lens.model(),
+            domain: vec![],
             project: self.project,
             rasterize: self.rasterize,
             inputs: Inputs {
@@ -206,6 +220,8 @@ impl Sketch {
                 viewmat: gather(vec![4, 4], rows.to_vec()),
                 intrinsics: gather(vec![4], self.intrinsics.to_vec()),
                 background: gather(vec![3], self.background.to_vec()),
+                distortion: (!distortion.is_empty())
+                    .then(|| gather(vec![distortion.len()], distortion)),
             },
             upstream: Outputs {
                 image,
@@ -213,7 +229,10 @@ impl Sketch {
                 depth,
             },
             absgrad: true,
-        }
+        };
+        // Of the rounded coefficients.
+        scene.domain = scene.defined_domain().into_iter().map(rounded).collect();
+        scene
     }
 }
 

@@ -7,7 +7,7 @@ pub(crate) mod unique;
 use std::path::Path;
 
 use safetensors::{Dtype, SafeTensors};
-use splat_ops::{ImageSize, sh_coefficient_count};
+use splat_ops::{CameraModel, ImageSize, sh_coefficient_count};
 
 pub use self::metadata::KEYS;
 use self::metadata::Metadata;
@@ -103,9 +103,9 @@ struct Reader<'a> {
 
 impl Reader<'_> {
     fn fixture(&self) -> Result<Fixture, GradcheckError> {
-        self.metadata.check_camera_model()?;
+        let model = self.metadata.camera_model()?;
         self.metadata.check_keys()?;
-        self.check_names()?;
+        self.check_names(model)?;
         // N and C come from the first tensors that have them; all other shapes must agree.
         let means = self.any("means")?;
         let n = match means.shape.as_slice() {
@@ -158,6 +158,9 @@ impl Reader<'_> {
                 viewmat: get("viewmat", &with(&[4, 4]))?,
                 intrinsics: get("intrinsics", &with(&[4]))?,
                 background: get("background", &[3])?,
+                distortion: (model != CameraModel::Pinhole)
+                    .then(|| get("distortion", &with(&[model.coefficients()])))
+                    .transpose()?,
             })
         };
         let (picture, single) = (with(&[height, width, 3]), with(&[height, width, 1]));
@@ -184,19 +187,22 @@ impl Reader<'_> {
             .then(|| self.exactly(ABSGRAD, &with(&[n, 2])))
             .transpose()?;
         self.check_ranges(&scene_inputs)?;
-        let scene = Scene {
+        let mut scene = Scene {
             source: self.file.to_path_buf(),
             cameras: front.first().copied().unwrap_or(1),
             gaussians: n,
             size,
             sh_degree,
             antialias: self.metadata.flag("antialias")?,
+            model,
+            domain: vec![],
             project,
             rasterize,
             inputs: scene_inputs,
             upstream,
             absgrad: absgrad.is_some(),
         };
+        scene.domain = self.domain(&scene, has("domain"), &with(&[2]))?;
         Ok(Fixture {
             case: self.metadata.case(),
             hard: self.metadata.flag("hard")?,
@@ -205,6 +211,29 @@ impl Reader<'_> {
             gradients: inputs("grad.")?,
             absgrad,
         })
+    }
+
+    /// Domains of the lenses: those of the file if it `has` them, else by their definition.
+    fn domain(
+        &self,
+        scene: &Scene,
+        has: bool,
+        shape: &[usize],
+    ) -> Result<Vec<f64>, GradcheckError> {
+        if has {
+            let domain = self.exactly("domain", shape)?;
+            let sign =
+                |at: usize| at % 2 == 0 && domain.values[at] <= 0.0 || domain.values[at] < 0.0;
+            return match (0..domain.values.len()).find(|at| sign(*at)) {
+                None => Ok(domain.values),
+                Some(at) => {
+                    let (value, index) = (domain.values[at], index_of(at, shape));
+                    let reason = format!("value {value} at {index:?} must be positive");
+                    Err(self.tensor("domain", reason))
+                }
+            };
+        }
+        Ok(scene.defined_domain())
     }
 
     /// Refuses invalid Gaussians and cameras, which the reference and our ops might interpret
@@ -234,7 +263,7 @@ impl Reader<'_> {
     }
 
     /// Refuses tensors that nothing would check.
-    fn check_names(&self) -> Result<(), GradcheckError> {
+    fn check_names(&self, model: CameraModel) -> Result<(), GradcheckError> {
         let mut names = self.tensors.names();
         names.sort();
         for name in names {
@@ -243,8 +272,13 @@ impl Reader<'_> {
             if INPUTS.contains(&input) || PICTURES.contains(&picture) || name == ABSGRAD {
                 continue;
             }
+            let bent = model != CameraModel::Pinhole;
+            if bent && (input == "distortion" || name == "domain") {
+                continue;
+            }
             let reason = match input {
                 "distortion" => "is too many: the camera model `pinhole` has no distortion",
+                "domain" if name == "grad.domain" => "is too many: a domain has no gradient",
                 "domain" => "is too many: the camera model `pinhole` has no domain",
                 _ => "is not part of the format; remove it, or correct its name",
             };

@@ -82,7 +82,7 @@ pub struct FileReport {
     /// Largest relative L2 error that passes.
     pub gate: f64,
     /// Groups: means, quats, scales, opacities, sh0, sh_rest, viewmat, intrinsics, background and,
-    /// if the fixture has it, absgrad.
+    /// if the fixture has them, distortion and absgrad.
     pub groups: Vec<GroupReport>,
     /// Images: image, alpha and, if the fixture has it, depth.
     pub outputs: Vec<OutputReport>,
@@ -197,7 +197,7 @@ fn groups(inputs: &Inputs) -> Vec<Group> {
         array: array.clone(),
         offset: vec![0; array.shape.len()],
     };
-    vec![
+    let mut groups = vec![
         whole("means", &inputs.means),
         whole("quats", &inputs.quats),
         whole("scales", &inputs.scales),
@@ -207,7 +207,10 @@ fn groups(inputs: &Inputs) -> Vec<Group> {
         whole("viewmat", &inputs.viewmat),
         whole("intrinsics", &inputs.intrinsics),
         whole("background", &inputs.background),
-    ]
+    ];
+    let distortion = inputs.distortion.as_ref();
+    groups.extend(distortion.map(|array| whole("distortion", array)));
+    groups
 }
 
 /// Coefficients `from..to` of `[N, K, 3]`.

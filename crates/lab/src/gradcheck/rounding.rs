@@ -7,7 +7,8 @@
 //!
 //! ```text
 //! p = W mu + t          dp = 4 u (|W| |mu| + |t|), nothing where every product and sum is a single-precision number
-//! m = f p.x / p.z + c   dm = |f / p.z| (dp.x + |p.x / p.z| dp.z) + 8 u |f p.x / p.z| + u |c|
+//! m = f p.x / p.z + c, where the camera is a pinhole,
+//!                       dm = |f / p.z| (dp.x + |p.x / p.z| dp.z) + 8 u |f p.x / p.z| + u |c|
 //! z1 = w11 dx           dz1 = 16 u |w11 dx| + w11 dm.x
 //! z2 = w21 dx + w22 dy  dz2 = 16 u (|w21 dx| + |w22 dy|) + |w21| dm.x + w22 dm.y
 //! sigma = |z|^2 / 2     dsigma = |z1| dz1 + |z2| dz2 + (dz1^2 + dz2^2) / 2
@@ -19,6 +20,8 @@
 //! that are exact in any order of operations have no error: a mean on a pixel's centre has an alpha
 //! of exactly its opacity, and 1/2 of 1/2 is 1/4.
 
+use splat_ops::{CameraModel, Lens};
+
 /// Largest relative error of rounding to single precision.
 const UNIT: f64 = f32::EPSILON as f64 / 2.0;
 
@@ -29,13 +32,21 @@ const QUOTIENT: f64 = 8.0;
 /// Roundings of the inverse Cholesky factor, its products, and the exponential.
 const CHAIN: f64 = 16.0;
 
-/// Error of a screen mean in pixels, from the Gaussian's mean, a row-major view matrix and fx, fy,
-/// cx, cy.
-pub(super) fn screen_mean(mean: &[f64], viewmat: &[f64], intrinsics: &[f64]) -> [f64; 2] {
+/// Error of a screen mean in pixels, from the Gaussian's mean, a row-major view matrix, fx, fy, cx,
+/// cy and the lens.
+pub(super) fn screen_mean(
+    mean: &[f64],
+    viewmat: &[f64],
+    intrinsics: &[f64],
+    lens: &Lens,
+) -> [f64; 2] {
     let [(x, dx), (y, dy), (z, dz)] = [0, 4, 8].map(|row| {
         let row = &viewmat[row..row + 4];
         sum([row[0] * mean[0], row[1] * mean[1], row[2] * mean[2], row[3]])
     });
+    if lens.model() != CameraModel::Pinhole {
+        return bent_mean([x, y, z], [dx, dy, dz], intrinsics, lens);
+    }
     let along = |p: f64, dp: f64, f: f64, c: f64| {
         let quotient = (f * p / z).abs();
         (f / z).abs() * (dp + (p / z).abs() * dz) + UNIT * (QUOTIENT * quotient + c.abs())
@@ -44,6 +55,29 @@ pub(super) fn screen_mean(mean: &[f64], viewmat: &[f64], intrinsics: &[f64]) -> 
         along(x, dx, intrinsics[0], intrinsics[2]),
         along(y, dy, intrinsics[1], intrinsics[3]),
     ]
+}
+
+/// The same where a lens bends the way: the errors of the position through the lens's slopes, here
+/// differences, and those of the lens's own formula, as many as of the whole chain.
+fn bent_mean(p: [f64; 3], dp: [f64; 3], intrinsics: &[f64], lens: &Lens) -> [f64; 2] {
+    let length = p.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let step = 1e-6 * length;
+    let mut error = [0.0; 2];
+    let Some(point) = lens.distort(p) else {
+        return error;
+    };
+    for axis in 0..3 {
+        let mut moved = p;
+        moved[axis] += step;
+        let there = lens.distort(moved).unwrap_or(point);
+        for i in 0..2 {
+            error[i] += ((there[i] - point[i]) / step).abs() * dp[axis];
+        }
+    }
+    std::array::from_fn(|i| {
+        let (f, c) = (intrinsics[i], intrinsics[2 + i]);
+        f.abs() * (error[i] + CHAIN * UNIT * point[i].abs()) + UNIT * c.abs()
+    })
 }
 
 /// A sum in order, with its error.

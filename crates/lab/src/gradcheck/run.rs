@@ -1,7 +1,9 @@
 //! Renders a scene with the ops and takes the gradients of its loss with Burn's autodiff.
 
 use burn::tensor::{DType, Device, Gradients, Tensor, TensorData};
-use splat_ops::{OpError, Projected, Rendered, project, rasterize, spherical_harmonics};
+use splat_ops::{
+    Distortion, Intrinsics, OpError, Projected, Rendered, project, rasterize, spherical_harmonics,
+};
 
 use super::scene::{Array, Inputs, Outputs, Scene};
 use super::{GradcheckError, Precision};
@@ -137,6 +139,7 @@ struct Leaves {
     viewmats: Tensor<3>,
     intrinsics: Tensor<2>,
     background: Tensor<1>,
+    distortion: Option<Distortion>,
 }
 
 impl Leaves {
@@ -144,7 +147,17 @@ impl Leaves {
         let (c, n) = (scene.cameras, scene.gaussians);
         let inputs = &scene.inputs;
         let rows = inputs.sh_coeffs.shape[1];
+        let domain = Array {
+            shape: vec![c, 2],
+            values: scene.domain.clone(),
+        };
+        let distortion = inputs.distortion.as_ref().map(|coefficients| Distortion {
+            model: scene.model,
+            coefficients: upload.leaf(coefficients, [c, scene.model.coefficients()]),
+            domain: upload.constant(&domain, [c, 2]),
+        });
         Self {
+            distortion,
             means: upload.leaf(&inputs.means, [n, 3]),
             quats: upload.leaf(&inputs.quats, [n, 4]),
             scales: upload.leaf(&inputs.scales, [n, 3]),
@@ -174,7 +187,10 @@ impl Leaves {
             quats,
             scales,
             self.viewmats.clone(),
-            self.intrinsics.clone(),
+            Intrinsics {
+                pinhole: self.intrinsics.clone(),
+                distortion: self.distortion.clone(),
+            },
             scene.size,
             &settings,
         )?;
@@ -255,6 +271,9 @@ impl Leaves {
             viewmat: download.gradient(self.viewmats.grad(grads), &inputs.viewmat)?,
             intrinsics: download.gradient(self.intrinsics.grad(grads), &inputs.intrinsics)?,
             background: download.gradient(self.background.grad(grads), &inputs.background)?,
+            distortion: (inputs.distortion.as_ref().zip(self.distortion.as_ref()))
+                .map(|(like, leaf)| download.gradient(leaf.coefficients.grad(grads), like))
+                .transpose()?,
         })
     }
 }

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use splat_ops::{ImageSize, ProjectSettings, RasterizeSettings};
+use splat_ops::{CameraModel, ImageSize, Lens, ProjectSettings, RasterizeSettings};
 
 /// A row-major tensor on the host, in double precision.
 #[derive(Debug, Clone, PartialEq)]
@@ -50,6 +50,8 @@ pub struct Inputs {
     pub intrinsics: Array,
     /// `[3]`.
     pub background: Array,
+    /// `[K]` or `[C, K]`: coefficients of the lens; `None` for a pinhole.
+    pub distortion: Option<Array>,
 }
 
 /// Images of a fixture, or their upstream gradients; with a leading C if the viewmat has it.
@@ -59,7 +61,7 @@ pub struct Outputs {
     pub image: Array,
     /// `[H, W, 1]`.
     pub alpha: Array,
-    /// `[H, W, 1]`, accumulated camera z. Present if the fixture has a depth loss or image.
+    /// `[H, W, 1]`, accumulated depth: camera z, or the distance for a fisheye. Present if the fixture has a depth loss or image.
     pub depth: Option<Array>,
 }
 
@@ -78,6 +80,10 @@ pub struct Scene {
     pub sh_degree: usize,
     /// True if opacities are multiplied by the compensation of the low-pass filter.
     pub antialias: bool,
+    /// Camera model.
+    pub model: CameraModel,
+    /// Largest radius or angle and radius of the clamp, one pair per camera; empty for a pinhole.
+    pub domain: Vec<f64>,
     /// Settings of the projection.
     pub project: ProjectSettings,
     /// Settings of the rasteriser.
@@ -88,6 +94,35 @@ pub struct Scene {
     pub upstream: Outputs,
     /// Whether the absolute gradients of the screen means are wanted too.
     pub absgrad: bool,
+}
+
+impl Scene {
+    /// The lens of every camera.
+    pub(crate) fn lenses(&self) -> Vec<Lens> {
+        let values = self.inputs.distortion.as_ref().map(|array| &array.values);
+        let k = self.model.coefficients();
+        let lens = |camera: usize| {
+            let coefficients = values?.get(k * camera..k * (camera + 1))?;
+            Lens::new(self.model, coefficients)
+        };
+        let cameras = 0..self.cameras;
+        cameras
+            .map(|camera| lens(camera).unwrap_or_default())
+            .collect()
+    }
+
+    /// Domains of the lenses by their definition, as [`Scene::domain`] has them.
+    pub(crate) fn defined_domain(&self) -> Vec<f64> {
+        if self.model == CameraModel::Pinhole {
+            return vec![];
+        }
+        let intrinsics = self.inputs.intrinsics.values.as_chunks::<4>().0;
+        let lenses = self.lenses().into_iter().zip(intrinsics);
+        lenses
+            .map(|(lens, intrinsics)| lens.domain(*intrinsics, self.size))
+            .flat_map(|domain| [domain.limit, domain.clamp])
+            .collect()
+    }
 }
 
 /// Position in every dimension of a flat index into a row-major array.

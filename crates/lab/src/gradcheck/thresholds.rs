@@ -100,8 +100,11 @@ fn walk_pixels(
     let views = scene.inputs.viewmat.values.chunks_exact(16);
     let intrinsics = scene.inputs.intrinsics.values.chunks_exact(4);
     let mut index = 0;
-    for (((packed, opacities), view), intrinsics) in
-        cameras.zip(opacities).zip(views).zip(intrinsics)
+    for ((((packed, opacities), view), intrinsics), lens) in cameras
+        .zip(opacities)
+        .zip(views)
+        .zip(intrinsics)
+        .zip(scene.lenses())
     {
         let rows = packed.chunks_exact(9).zip(opacities);
         let mut splats: Vec<_> = rows
@@ -110,7 +113,7 @@ fn walk_pixels(
             .map(|((row, opacity), mean)| ScreenSplat {
                 row,
                 opacity: *opacity,
-                mean_error: rounding::screen_mean(mean, view, intrinsics),
+                mean_error: rounding::screen_mean(mean, view, intrinsics, &lens),
             })
             .collect();
         splats.sort_by(|a, b| a.row[2].total_cmp(&b.row[2])); // stable: ties by index

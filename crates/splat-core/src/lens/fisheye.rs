@@ -19,10 +19,10 @@ pub(super) fn limit(k: &[f64; 4]) -> f64 {
 }
 
 /// The distorted point, where the lens is defined.
-pub(super) fn distort(k: &[f64; 4], [x, y, z]: [f64; 3]) -> Option<[f64; 2]> {
+pub(super) fn distort(k: &[f64; 4], limit: f64, [x, y, z]: [f64; 3]) -> Option<[f64; 2]> {
     let rho = x.hypot(y);
     let theta = rho.atan2(z);
-    if !(theta < limit(k)) {
+    if !(theta < limit) {
         return None;
     }
     let scale = if rho > 0.0 {
@@ -34,12 +34,12 @@ pub(super) fn distort(k: &[f64; 4], [x, y, z]: [f64; 3]) -> Option<[f64; 2]> {
 }
 
 /// The direction, of length 1.
-pub(super) fn undistort(k: &[f64; 4], [a, b]: [f64; 2]) -> Option<[f64; 3]> {
+pub(super) fn undistort(k: &[f64; 4], limit: f64, [a, b]: [f64; 2]) -> Option<[f64; 3]> {
     let distorted = a.hypot(b);
     if distorted == 0.0 {
         return Some([0.0, 0.0, 1.0]);
     }
-    let theta = crossing(|theta| bend(k, theta) - distorted, 0.0, limit(k))?;
+    let theta = crossing(|theta| bend(k, theta) - distorted, 0.0, limit)?;
     let (sin, cos) = theta.sin_cos();
     Some([sin * a / distorted, sin * b / distorted, cos])
 }

@@ -58,19 +58,19 @@ pub(super) fn limit(k: &[f64; 8]) -> f64 {
         .min(FARTHEST)
 }
 
-fn is_defined(k: &[f64; 8], [a, b]: [f64; 2], jacobian: [f64; 3]) -> bool {
+fn is_defined(limit: f64, [a, b]: [f64; 2], jacobian: [f64; 3]) -> bool {
     let [d11, d12, d22] = jacobian;
-    a.hypot(b) < limit(k) && d11 * d22 - d12 * d12 > 0.0
+    a.hypot(b) < limit && d11 * d22 - d12 * d12 > 0.0
 }
 
 /// The distorted point, where the lens is defined.
-pub(super) fn distort(k: &[f64; 8], point: [f64; 2]) -> Option<[f64; 2]> {
+pub(super) fn distort(k: &[f64; 8], limit: f64, point: [f64; 2]) -> Option<[f64; 2]> {
     let bent = bend(k, point);
-    is_defined(k, point, bent.jacobian).then_some(bent.point)
+    is_defined(limit, point, bent.jacobian).then_some(bent.point)
 }
 
 /// The undistorted point: the radius by bisection, then Newton's method for the tangential part.
-pub(super) fn undistort(k: &[f64; 8], [a, b]: [f64; 2]) -> Option<[f64; 2]> {
+pub(super) fn undistort(k: &[f64; 8], limit: f64, [a, b]: [f64; 2]) -> Option<[f64; 2]> {
     let distorted = a.hypot(b);
     if distorted == 0.0 && k[2] == 0.0 && k[3] == 0.0 {
         return Some([0.0, 0.0]);
@@ -79,7 +79,7 @@ pub(super) fn undistort(k: &[f64; 8], [a, b]: [f64; 2]) -> Option<[f64; 2]> {
         let [k1, k2, _, _, k3, k4, k5, k6] = *k;
         [k1, k2, 0.0, 0.0, k3, k4, k5, k6]
     };
-    let end = limit(k) * (1.0 - 1e-12);
+    let end = limit * (1.0 - 1e-12);
     let radius = crossing(|r| bend(&radial, [r, 0.0]).point[0] - distorted, 0.0, end);
     // Tangential distortion can bring in what is just outside.
     let scale = radius.unwrap_or(if distorted > 0.0 { end } else { 0.0 }) / distorted.max(1e-300);
@@ -103,5 +103,5 @@ pub(super) fn undistort(k: &[f64; 8], [a, b]: [f64; 2]) -> Option<[f64; 2]> {
     }
     let bent = bend(k, guess);
     let missed = (bent.point[0] - a).hypot(bent.point[1] - b);
-    (missed <= 1e-9 * (1.0 + distorted) && is_defined(k, guess, bent.jacobian)).then_some(guess)
+    (missed <= 1e-9 * (1.0 + distorted) && is_defined(limit, guess, bent.jacobian)).then_some(guess)
 }

@@ -23,6 +23,7 @@ mod jpeg;
 mod save;
 mod sparse_model;
 mod split;
+mod undistort;
 
 use derive_setters::Setters;
 use std::collections::HashMap;
@@ -224,6 +225,26 @@ impl View {
         }
     }
 
+    /// The view at the pose of another camera.
+    #[must_use]
+    pub fn with_pose(&self, camera: &Camera) -> Self {
+        let row = |i| camera.viewmat.row(i).to_array();
+        Self {
+            viewmat: [row(0), row(1), row(2), row(3)],
+            ..self.clone()
+        }
+    }
+
+    /// The view with the camera's pose, intrinsics and lens.
+    #[must_use]
+    pub fn with_camera(&self, camera: &Camera) -> Self {
+        Self {
+            intrinsics: camera.intrinsics,
+            lens: camera.lens,
+            ..self.with_pose(camera)
+        }
+    }
+
     /// The view with its photo area-averaged by `factor`, as in [`CaptureSettings::downscale`], or
     /// by the largest smaller power of two that leaves both sides at least as long as SSIM's
     /// window.
@@ -258,13 +279,21 @@ impl View {
     /// [`depth`](Lens::depth). `None` if the point is behind the camera, or where the lens is not
     /// defined.
     pub fn project(&self, point: [f64; 3]) -> Option<([f64; 2], f64)> {
-        let [x, y, z]: [f64; 3] = std::array::from_fn(|row| {
-            let r = &self.viewmat[row];
-            r[0] * point[0] + r[1] * point[1] + r[2] * point[2] + r[3]
-        });
-        let [fx, fy, cx, cy] = self.intrinsics;
-        let [a, b] = self.lens.distort([x, y, z])?;
-        Some(([fx * a + cx, fy * b + cy], self.lens.depth([x, y, z])))
+        self.projection()(point)
+    }
+
+    /// [`project`](Self::project) for many points.
+    pub fn projection(&self) -> impl Fn([f64; 3]) -> Option<([f64; 2], f64)> + '_ {
+        let bounded = self.lens.bounded();
+        move |point| {
+            let p = std::array::from_fn(|row| {
+                let r = &self.viewmat[row];
+                r[0] * point[0] + r[1] * point[1] + r[2] * point[2] + r[3]
+            });
+            let [fx, fy, cx, cy] = self.intrinsics;
+            let [a, b] = bounded.distort(p)?;
+            Some(([fx * a + cx, fy * b + cy], self.lens.depth(p)))
+        }
     }
 }
 

@@ -1,4 +1,4 @@
-//! `project`: saves its five inputs; the backward pass recomputes the intermediates.
+//! `project`: saves its inputs; the backward pass recomputes the intermediates.
 
 use burn::backend::autodiff::checkpoint::strategy::CheckpointStrategy;
 use burn::backend::{Autodiff, tensor::FloatTensor};
@@ -15,8 +15,8 @@ struct Project<B: ProjectBackend> {
     args: ProjectArgs,
 }
 
-impl<B: ProjectBackend> Saved<B, 5> for Project<B> {
-    fn gradients(self, grad: FloatTensor<B>, needs_grad: [bool; 5]) -> [Option<FloatTensor<B>>; 5] {
+impl<B: ProjectBackend> Saved<B, 7> for Project<B> {
+    fn gradients(self, grad: FloatTensor<B>, needs_grad: [bool; 7]) -> [Option<FloatTensor<B>>; 7] {
         let _span = trace_span!("project gradient").entered();
         B::project_backward(self.inputs, grad, &self.args, needs_grad.into()).into()
     }
@@ -24,9 +24,15 @@ impl<B: ProjectBackend> Saved<B, 5> for Project<B> {
 
 impl<B: ProjectBackend, C: CheckpointStrategy> ProjectOps for Autodiff<B, C> {
     fn project(OpInputs(inputs): ProjectInputs<Self>, args: ProjectArgs) -> FloatTensor<Self> {
-        record::<B, C, Project<B>, _, 5>(
-            <[_; 5]>::from(inputs.clone()).map(|input| input.node()),
-            OpInputs(inputs.map(|input| input.into_primitive())),
+        // A parent that is absent is one that is not tracked.
+        let untracked = || FloatTensor::<Self>::new(inputs.means.primitive().clone()).node();
+        let nodes = inputs.inputs().map(|input| match input {
+            Some(input) => input.node(),
+            None => untracked(),
+        });
+        record::<B, C, Project<B>, _, 7>(
+            nodes.into(),
+            OpInputs(inputs.map_inputs(|input| input.into_primitive())),
             |inputs| (B::project(inputs.clone(), args), Project { inputs, args }),
             |inputs| B::project(inputs, args),
         )

@@ -1,6 +1,7 @@
 //! Projection of Gaussians to screen splats, and its gradient.
 //!
-//! With p = W mean + t = (x, y, z) in camera space, and u = x/z, v = y/z clamped near the view:
+//! With the Jacobian J of the camera at the mean, for a pinhole with p = W mean + t = (x, y, z) in
+//! camera space and u = x/z, v = y/z clamped near the view:
 //!
 //! ```text
 //! J = | fx/z   0    -fx u/z |      V = (J W R) diag(s), rows V1, V2
@@ -14,11 +15,18 @@
 //!
 //! `a c - b b` would lose the determinant of a needle in single precision; the minors keep it. V
 //! and e are in units of the splat's own size (`k` pixels), so that nothing overflows or
-//! underflows, whether the splat is a millionth of a pixel or a million images wide.
+//! underflows, whether the splat is a millionth of a pixel or a million images wide. Camera models
+//! differ in the screen mean, J, depth and domain only: each is a `Lens`, in a file of its own.
 
 mod camera;
+mod distorted;
+mod fisheye;
 mod gradient;
+mod opencv;
+mod pinhole;
 mod splat;
+#[cfg(test)]
+mod tests;
 
 use core::marker::PhantomData;
 use core::ops::Range;
@@ -27,8 +35,12 @@ use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
 use rayon::prelude::*;
 
-use self::camera::Camera;
+use self::camera::{COEFFICIENTS, Camera, Lens};
+use self::distorted::Distorted;
+use self::fisheye::OpenCvFisheye;
 use self::gradient::splat_backward;
+use self::opencv::OpenCv;
+use self::pinhole::Pinhole;
 use self::splat::{Gaussian, Splat};
 use super::buffer::{Buffer, tensor};
 use super::real::Real;
@@ -38,7 +50,7 @@ use crate::backend::{
     OpInputs, PROJECTED_WIDTH, ProjectBackend, ProjectGradients, ProjectInputs, ProjectOps,
     ProjectTensors,
 };
-use crate::settings::ProjectArgs;
+use crate::settings::{CameraModel, ProjectArgs};
 
 /// Gaussians per unit of parallel work. Fixed, so that sums over Gaussians have a fixed order.
 const CHUNK: usize = 512;
@@ -46,29 +58,42 @@ const CHUNK: usize = 512;
 const GAUSSIAN: usize = 10;
 /// Columns of a splat that carry a gradient: all but the extents.
 const GRADED: usize = 7;
-/// Columns of a camera's gradient: W, t, then fx, fy, cx, cy.
-const CAMERA: usize = 16;
+/// Columns of a camera's gradient: W, t, then fx, fy, cx, cy, then the coefficients.
+const CAMERA: usize = 16 + COEFFICIENTS;
 
-/// The five inputs.
-struct Inputs<'a, T> {
+type Tensors<X> = ProjectTensors<X, Option<X>>;
+
+/// The inputs.
+struct Inputs<'a, T, L> {
     means: &'a [T],
     quats: &'a [T],
     scales: &'a [T],
-    cameras: Vec<Camera<T>>,
+    cameras: Vec<Camera<T, L>>,
 }
 
-impl<'a, T: Real> Inputs<'a, T> {
-    fn new(buffers: &'a ProjectTensors<Buffer>, args: &ProjectArgs) -> Self {
+impl<'a, T: Real, L: Lens<T>> Inputs<'a, T, L> {
+    fn new(buffers: &'a Tensors<Buffer>, args: &ProjectArgs) -> Self {
         let viewmats = buffers.viewmats.slice::<T>();
         let intrinsics = buffers.intrinsics.slice::<T>();
+        // A pinhole has neither.
+        let lens = |buffer: &'a Option<Buffer>, width: usize, camera: usize| {
+            let values = buffer.as_ref().map_or(&[][..], Buffer::slice::<T>);
+            values
+                .get(width * camera..width * (camera + 1))
+                .unwrap_or(&[])
+        };
+        let cameras = viewmats.chunks_exact(16).zip(intrinsics.chunks_exact(4));
         Self {
             means: buffers.means.slice(),
             quats: buffers.quats.slice(),
             scales: buffers.scales.slice(),
-            cameras: viewmats
-                .chunks_exact(16)
-                .zip(intrinsics.chunks_exact(4))
-                .map(|(viewmat, intrinsics)| Camera::new(viewmat, intrinsics, args))
+            cameras: cameras
+                .enumerate()
+                .map(|(index, (viewmat, intrinsics))| {
+                    let coefficients = lens(&buffers.distortion, L::COEFFICIENTS, index);
+                    let domain = lens(&buffers.domain, 2, index);
+                    Camera::new(viewmat, intrinsics, coefficients, domain, args)
+                })
                 .collect(),
         }
     }
@@ -112,9 +137,9 @@ fn gaussian<T: Real>(columns: &[Lanes<T>; GAUSSIAN], lane: usize) -> Gaussian<T>
 
 vectorized! {
     /// Packed columns of a block of splats; zero if culled.
-    fn project_lanes<T: Real, const FMA: bool>(
+    fn project_lanes<T: Real, with L: Lens<T>, const FMA: bool>(
         gaussians: &[Lanes<T>; GAUSSIAN],
-        camera: &Camera<T>,
+        camera: &Camera<T, L>,
         packed: &mut [Lanes<T>; PROJECTED_WIDTH],
     ) {
         for lane in 0..LANES {
@@ -152,11 +177,22 @@ impl ProjectBackend for Flex {
 
 fn forward<T: Real>(
     _: PhantomData<T>,
-    inputs: ProjectTensors<FlexTensor>,
+    inputs: Tensors<FlexTensor>,
     args: &ProjectArgs,
 ) -> FlexTensor {
-    let buffers = inputs.map(Buffer::new);
-    let inputs = Inputs::<T>::new(&buffers, args);
+    match args.model {
+        CameraModel::Pinhole => forward_with::<T, Pinhole<T>>(inputs, args),
+        CameraModel::OpenCv => forward_with::<T, Distorted<OpenCv<T>>>(inputs, args),
+        CameraModel::OpenCvFisheye => forward_with::<T, Distorted<OpenCvFisheye<T>>>(inputs, args),
+    }
+}
+
+fn forward_with<T: Real, L: Lens<T>>(
+    inputs: Tensors<FlexTensor>,
+    args: &ProjectArgs,
+) -> FlexTensor {
+    let buffers = inputs.map_inputs(Buffer::new);
+    let inputs = Inputs::<T, L>::new(&buffers, args);
     let (c, n) = (inputs.cameras.len(), inputs.count());
     let mut packed = Uncleared::<T>::new(c * n * PROJECTED_WIDTH);
     let parts = packed.chunks_of_each(c, CHUNK * PROJECTED_WIDTH);
@@ -181,27 +217,27 @@ fn forward<T: Real>(
 vectorized! {
     /// Gradients of a block of Gaussians in one camera, and their contribution to the camera's
     /// gradient, if wanted; zero if culled.
-    fn project_lanes_backward<T: Real, const FMA: bool>(
+    fn project_lanes_backward<T: Real, with L: Lens<T>, const FMA: bool>(
         gaussians: &[Lanes<T>; GAUSSIAN],
-        camera: &Camera<T>,
+        camera: &Camera<T, L>,
         grad: &[Lanes<T>; GRADED],
         gradients: &mut [Lanes<T>; GAUSSIAN],
         of_camera: Option<&mut [Lanes<T>; CAMERA]>,
     ) {
         match of_camera {
-            Some(of_camera) => lanes_backward::<T, true>(gaussians, camera, grad, gradients, of_camera),
+            Some(of_camera) => lanes_backward::<T, L, true>(gaussians, camera, grad, gradients, of_camera),
             None => {
                 let nowhere = &mut [[T::ZERO; LANES]; CAMERA];
-                lanes_backward::<T, false>(gaussians, camera, grad, gradients, nowhere);
+                lanes_backward::<T, L, false>(gaussians, camera, grad, gradients, nowhere);
             }
         }
     }
 }
 
 #[inline(always)]
-fn lanes_backward<T: Real, const OF_CAMERA: bool>(
+fn lanes_backward<T: Real, L: Lens<T>, const OF_CAMERA: bool>(
     gaussians: &[Lanes<T>; GAUSSIAN],
-    camera: &Camera<T>,
+    camera: &Camera<T, L>,
     grad: &[Lanes<T>; GRADED],
     gradients: &mut [Lanes<T>; GAUSSIAN],
     of_camera: &mut [Lanes<T>; CAMERA],
@@ -233,6 +269,9 @@ fn lanes_backward<T: Real, const OF_CAMERA: bool>(
             for i in 0..4 {
                 of_camera[12 + i][lane] += kept(g.camera.intrinsics[i]);
             }
+            for i in 0..L::COEFFICIENTS {
+                of_camera[16 + i][lane] += kept(g.camera.coefficients[i]);
+            }
         }
     }
 }
@@ -249,7 +288,12 @@ struct Chunk<'a, T> {
 
 impl<T: Real> Chunk<'_, T> {
     /// Adds the gradients through one camera; returns the camera's gradient.
-    fn add(&mut self, inputs: &Inputs<T>, camera: &Camera<T>, grad: &[T]) -> [T; CAMERA] {
+    fn add<L: Lens<T>>(
+        &mut self,
+        inputs: &Inputs<T, L>,
+        camera: &Camera<T, L>,
+        grad: &[T],
+    ) -> [T; CAMERA] {
         let mut of_camera = [[T::ZERO; LANES]; CAMERA];
         // Most splats of most views have no gradient: culled, covered or too faint.
         let is_graded = |row: usize| {
@@ -262,11 +306,11 @@ impl<T: Real> Chunk<'_, T> {
         of_camera.map(|lanes| lanes.into_iter().fold(T::ZERO, |sum, value| sum + value))
     }
 
-    fn add_block(
+    fn add_block<L: Lens<T>>(
         &mut self,
         rows: &[usize],
-        inputs: &Inputs<T>,
-        camera: &Camera<T>,
+        inputs: &Inputs<T, L>,
+        camera: &Camera<T, L>,
         grad: &[T],
         of_camera: &mut [Lanes<T>; CAMERA],
     ) {
@@ -297,13 +341,28 @@ impl<T: Real> Chunk<'_, T> {
 
 fn backward<T: Real>(
     _: PhantomData<T>,
-    inputs: ProjectTensors<FlexTensor>,
+    inputs: Tensors<FlexTensor>,
+    grad: FlexTensor,
+    args: &ProjectArgs,
+    needed: ProjectTensors<bool>,
+) -> ProjectGradients<Flex> {
+    match args.model {
+        CameraModel::Pinhole => backward_with::<T, Pinhole<T>>(inputs, grad, args, needed),
+        CameraModel::OpenCv => backward_with::<T, Distorted<OpenCv<T>>>(inputs, grad, args, needed),
+        CameraModel::OpenCvFisheye => {
+            backward_with::<T, Distorted<OpenCvFisheye<T>>>(inputs, grad, args, needed)
+        }
+    }
+}
+
+fn backward_with<T: Real, L: Lens<T>>(
+    inputs: Tensors<FlexTensor>,
     grad_packed: FlexTensor,
     args: &ProjectArgs,
     needs_grad: ProjectTensors<bool>,
 ) -> ProjectGradients<Flex> {
-    let buffers = inputs.map(Buffer::new);
-    let inputs = Inputs::<T>::new(&buffers, args);
+    let buffers = inputs.map_inputs(Buffer::new);
+    let inputs = Inputs::<T, L>::new(&buffers, args);
     let grad = Buffer::new(grad_packed);
     let grad = grad.slice::<T>();
     let (c, n) = (inputs.cameras.len(), inputs.count());
@@ -321,7 +380,7 @@ fn backward<T: Real>(
                 means: means.cleared(),
                 quats: quats.cleared(),
                 scales: scales.cleared(),
-                of_cameras: needs_grad.viewmats || needs_grad.intrinsics,
+                of_cameras: needs_grad.viewmats || needs_grad.intrinsics || needs_grad.distortion,
             };
             let views = inputs
                 .cameras
@@ -349,11 +408,18 @@ fn backward<T: Real>(
         viewmats: needs_grad
             .viewmats
             .then(|| tensor(viewmat_gradients(&cameras), [c, 4, 4])),
-        intrinsics: needs_grad.intrinsics.then(|| {
-            let values = cameras.iter().flat_map(|camera| &camera[12..]).copied();
-            tensor(values.collect(), [c, 4])
+        intrinsics: (needs_grad.intrinsics).then(|| tensor(columns(&cameras, 12, 4), [c, 4])),
+        distortion: needs_grad.distortion.then(|| {
+            let k = L::COEFFICIENTS;
+            tensor(columns(&cameras, 16, k), [c, k])
         }),
+        domain: None,
     }
+}
+
+fn columns<T: Real>(cameras: &[[T; CAMERA]], first: usize, width: usize) -> Vec<T> {
+    let of_camera = |camera: &[T; CAMERA]| camera[first..first + width].to_vec();
+    cameras.iter().flat_map(of_camera).collect()
 }
 
 fn viewmat_gradients<T: Real>(cameras: &[[T; CAMERA]]) -> Vec<T> {

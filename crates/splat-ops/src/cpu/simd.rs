@@ -8,37 +8,38 @@ use core::ops::Range;
 ///
 /// `FMA` tells the body whether fused multiply-add is an instruction (otherwise it is a call). Rust
 /// never fuses by itself: unless the body asks for it, the results are the same either way.
+/// `with L: Trait<T>,` adds a type between the two.
 macro_rules! vectorized {
     (
         $(#[$meta:meta])*
-        $vis:vis fn $name:ident<T: Real, const FMA: bool>($($argument:ident: $type:ty),* $(,)?) $(-> $result:ty)? $body:block
+        $vis:vis fn $name:ident<T: Real, $(with $other:ident: $bound:ident<T>,)? const FMA: bool>($($argument:ident: $type:ty),* $(,)?) $(-> $result:ty)? $body:block
     ) => {
         $(#[$meta])*
-        $vis fn $name<T: Real>($($argument: $type),*) $(-> $result)? {
+        $vis fn $name<T: Real, $($other: $bound<T>)?>($($argument: $type),*) $(-> $result)? {
             #[inline(always)]
-            fn body<T: Real, const FMA: bool>($($argument: $type),*) $(-> $result)? $body
+            fn body<T: Real, $($other: $bound<T>,)? const FMA: bool>($($argument: $type),*) $(-> $result)? $body
 
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx2,fma")]
-                fn avx2<T: Real>($($argument: $type),*) $(-> $result)? {
-                    body::<T, true>($($argument),*)
+                fn avx2<T: Real, $($other: $bound<T>)?>($($argument: $type),*) $(-> $result)? {
+                    body::<T, $($other,)? true>($($argument),*)
                 }
                 // Twice as many registers, so that constants stay in them; and masks.
                 #[target_feature(enable = "avx2,fma,avx512f,avx512bw,avx512dq,avx512vl")]
-                fn avx512<T: Real>($($argument: $type),*) $(-> $result)? {
-                    body::<T, true>($($argument),*)
+                fn avx512<T: Real, $($other: $bound<T>)?>($($argument: $type),*) $(-> $result)? {
+                    body::<T, $($other,)? true>($($argument),*)
                 }
                 match $crate::cpu::InstructionSet::chosen() {
                     // SAFETY: `chosen` has checked that the processor has these features.
-                    $crate::cpu::InstructionSet::Avx512 => return unsafe { avx512($($argument),*) },
+                    $crate::cpu::InstructionSet::Avx512 => return unsafe { avx512::<T, $($other)?>($($argument),*) },
                     // SAFETY: as above.
-                    $crate::cpu::InstructionSet::Avx2 => return unsafe { avx2($($argument),*) },
+                    $crate::cpu::InstructionSet::Avx2 => return unsafe { avx2::<T, $($other)?>($($argument),*) },
                     _ => {}
                 }
             }
             // Every 64-bit Arm processor has fused multiply-add.
-            body::<T, { cfg!(any(target_arch = "aarch64", target_feature = "fma")) }>($($argument),*)
+            body::<T, $($other,)? { cfg!(any(target_arch = "aarch64", target_feature = "fma")) }>($($argument),*)
         }
     };
 }

@@ -15,15 +15,16 @@ use crate::settings::ProjectArgs;
 
 impl ProjectOps for CubeBackend {
     fn project(OpInputs(inputs): ProjectInputs<Self>, args: ProjectArgs) -> CubeTensor {
-        let inputs = inputs.map(prepare);
+        let inputs = inputs.map_inputs(prepare);
         let means = &inputs.means;
         let shape = [
             inputs.viewmats.shape()[0],
             means.shape()[0],
             PROJECTED_WIDTH,
         ];
-        let buffers = inputs.clone().map(|input| buffer(&input));
-        let packed = project(&means.client, &buffers, args.size, &args.settings);
+        let buffers = inputs.clone().map_inputs(|input| buffer(&input));
+        let client = &means.client;
+        let packed = project(client, &buffers, args.size, args.model, &args.settings);
         tensor(means, packed, Shape::from(shape))
     }
 }
@@ -35,13 +36,14 @@ impl ProjectBackend for CubeBackend {
         args: &ProjectArgs,
         needs_grad: ProjectTensors<bool>,
     ) -> ProjectGradients<Self> {
-        let inputs = inputs.map(prepare);
+        let inputs = inputs.map_inputs(prepare);
         let grad_packed = prepare(grad_packed);
         let grads = project_backward(
             &grad_packed.client,
-            &inputs.clone().map(|input| buffer(&input)),
+            &inputs.clone().map_inputs(|input| buffer(&input)),
             &buffer(&grad_packed),
             args.size,
+            args.model,
             &args.settings,
             needs_grad,
         );

@@ -23,6 +23,7 @@ use super::{
     Checkpoint, CheckpointError, History, IntoLoss, LossTerms, Progress, StrategyKind, TrainError,
     TrainSettings, Warning, resolution_schedule, views,
 };
+use crate::calibration::{RefineIntrinsics, RefinePoses};
 use crate::hooks::{Hook, Hooks};
 
 type MakeModel<M> = dyn FnOnce(&SplatData, &Device) -> M + Send;
@@ -197,11 +198,14 @@ impl<M: SplatModel> TrainerBuilder<M> {
             return Err(TrainError::Setup(reason.into()));
         }
         self.capture.check_trainable()?;
-        check_hook_names(&self.hooks)?;
         let loss = self.loss.take();
         let loss = loss.unwrap_or_else(|| LossTerms::l1_ssim(self.config.ssim_weight));
         let schedule = schedule(&self.capture, &self.config)?;
         let device = self.device.without_autodiff().autodiff();
+        let calibrating = calibration(&self.capture, &self.config, schedule.scene_scale, &device)?;
+        // Before other hooks, which then see the cameras as they are rendered.
+        self.hooks.0.splice(0..0, calibrating);
+        check_hook_names(&self.hooks)?;
         let mut record = RunRecord {
             capture: Fingerprint::of(&self.capture),
             config: self.config.clone(),
@@ -286,6 +290,27 @@ impl<M: SplatModel> TrainerBuilder<M> {
             coarse: resolution_schedule::CoarseViews::default(),
         })
     }
+}
+
+/// The hooks that refine the cameras, as far as the settings want it.
+fn calibration(
+    capture: &Capture,
+    config: &TrainSettings,
+    scene: SceneScale,
+    device: &Device,
+) -> Result<Vec<Box<dyn Hook>>, TrainError> {
+    let settings = &config.calibration;
+    let mut hooks: Vec<Box<dyn Hook>> = Vec::new();
+    if settings.intrinsics {
+        let hook = RefineIntrinsics::new(&capture.views, settings.clone(), device)?;
+        hooks.push(Box::new(hook));
+    }
+    if settings.poses {
+        let views = capture.split.train.len();
+        let hook = RefinePoses::new(views, scene, settings.clone(), device)?;
+        hooks.push(Box::new(hook));
+    }
+    Ok(hooks)
 }
 
 /// Length, scene size and seed of the run.

@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use splat_data::{Capture, View};
+use splat_data::{CameraModel, Capture, View};
 
 /// Properties that identify a capture: for each view name, size, camera, use and photo; and the
 /// points.
@@ -138,12 +138,19 @@ fn positions(capture: &Capture) -> u32 {
 impl ViewPrint {
     fn of(view: &View) -> Self {
         let numbers = view.intrinsics.iter().chain(view.viewmat.as_flattened());
-        let camera: Vec<u8> = numbers.flat_map(|value| value.to_le_bytes()).collect();
+        let numbers = numbers.chain(view.lens.coefficients());
+        let mut camera: Vec<u8> = numbers.flat_map(|value| value.to_le_bytes()).collect();
+        if view.lens.model() != CameraModel::Pinhole {
+            camera.extend(view.lens.model().name().as_bytes());
+        }
+        let mut photo = crc32fast::Hasher::new();
+        photo.update(&view.image);
+        photo.update(view.mask.as_ref().map_or(&[][..], |mask| mask));
         Self {
             name: view.name.clone(),
             size: [view.width, view.height],
             camera: crc32fast::hash(&camera),
-            photo: crc32fast::hash(&view.image),
+            photo: photo.finalize(),
             usage: Usage::NotUsed,
         }
     }

@@ -5,7 +5,7 @@ use std::cell::OnceCell;
 use burn::tensor::{Int, Tensor};
 use splat_model::CameraTensors;
 use splat_model::losses::SsimSettings;
-use splat_model::ops::{OpError, Rendered, photometric};
+use splat_model::ops::{OpError, Rendered, photometric, photometric_masked};
 
 use crate::photo::values;
 
@@ -19,6 +19,7 @@ pub struct TargetView<'a> {
     /// The step, from 0.
     pub step: usize,
     pixels: Tensor<4, Int>,
+    mask: Option<Tensor<4>>,
     /// Computed on demand.
     image: OnceCell<Tensor<4>>,
 }
@@ -36,8 +37,22 @@ impl<'a> TargetView<'a> {
             camera,
             step,
             pixels,
+            mask: None,
             image: OnceCell::new(),
         }
+    }
+
+    /// The view with a mask `[1, H, W, 1]`, or none.
+    #[must_use]
+    pub fn with_mask(mut self, mask: Option<Tensor<4>>) -> Self {
+        self.mask = mask;
+        self
+    }
+
+    /// The mask, `[1, H, W, 1]` from 0 (ignored) to 1; `None` if all pixels count. A loss over
+    /// pixels has to respect it, as [`LossTerms::l1_ssim`] does.
+    pub fn mask(&self) -> Option<Tensor<4>> {
+        self.mask.clone()
     }
 
     /// The photo, `[1, H, W, 3]` in [0, 1].
@@ -109,12 +124,18 @@ impl LossTerms {
         self
     }
 
-    /// The loss of 3DGS (eq. 7): `(1 - weight) L1 + weight (1 - SSIM)`.
+    /// The loss of 3DGS (eq. 7): `(1 - weight) L1 + weight (1 - SSIM)`, over the pixels that the
+    /// view's mask keeps.
     pub fn l1_ssim(ssim_weight: f64) -> Self {
         let args = SsimSettings::default().args();
         let terms = [("l1", 1.0 - ssim_weight), ("d_ssim", ssim_weight)];
         Self::new().terms(terms, move |view, rendered| {
-            Ok(photometric(rendered.packed(), view.pixels_u8(), &args)?.losses())
+            let (rendered, photo) = (rendered.packed(), view.pixels_u8());
+            let measured = match view.mask() {
+                None => photometric(rendered, photo, &args)?,
+                Some(mask) => photometric_masked(rendered, photo, mask, &args)?,
+            };
+            Ok(measured.losses())
         })
     }
 

@@ -4,13 +4,14 @@ use std::any::Any;
 use std::time::Duration;
 
 use burn::tensor::Device;
-use splat_data::{SceneSettings, SplatData, View};
+use splat_data::{Camera, Capture, SceneScale, SceneSettings, SplatData, View};
 use splat_model::{Gaussians, RenderSettings, SplatModel};
 use splat_ops::OpError;
 
 use super::checkpoint::RunRecord;
 use super::state::State;
 use super::{Checkpoint, CheckpointError, History};
+use crate::calibration::{AlignedScores, Aligning, RefineIntrinsics, RefinePoses};
 use crate::evaluate::{Scores, evaluate_with};
 use crate::hooks::Hook;
 
@@ -85,6 +86,59 @@ impl<M: SplatModel> Trained<M> {
             hooks,
             each,
         )
+    }
+
+    /// Cameras of all views of the run's capture as calibration has refined them, in the order of
+    /// the views; others as they were. Poses of held-out views are those of the capture.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn cameras(&self, capture: &Capture) -> Result<Vec<Camera>, OpError> {
+        let mut cameras: Vec<Camera> = capture.views.iter().map(View::camera).collect();
+        if let Some(intrinsics) = self.hook::<RefineIntrinsics>() {
+            for (view, camera) in capture.views.iter().zip(&mut cameras) {
+                *camera = intrinsics.refined(&view.name, camera)?;
+            }
+        }
+        if let Some(poses) = self.hook::<RefinePoses>() {
+            let trained = &capture.split.train;
+            let before: Vec<Camera> = trained.iter().map(|index| cameras[*index]).collect();
+            for (index, camera) in trained.iter().zip(poses.refined(&before)?) {
+                cameras[*index] = camera;
+            }
+        }
+        Ok(cameras)
+    }
+
+    /// Scores views whose poses are first aligned with the scene, in so many steps each; see
+    /// [`align_pose`](crate::calibration::align_pose). Other changes by hooks are included.
+    ///
+    /// # Errors
+    /// When an op refuses its input, or the device fails.
+    pub fn evaluate_aligned(
+        &self,
+        views: &[&View],
+        device: &Device,
+        steps: usize,
+    ) -> Result<AlignedScores, OpError> {
+        let scene = self.settings.scene_scale.and_then(SceneScale::new);
+        let scene = scene.unwrap_or_else(|| self.to_data().scene_scale());
+        let aligning = Aligning {
+            settings: &self.render_settings,
+            scene,
+            device,
+            steps,
+            hooks: &self.state.hooks,
+        };
+        let mut aligned = Vec::with_capacity(views.len());
+        for view in views {
+            let camera = aligning.align(&self.model, view)?;
+            aligned.push(view.with_pose(&camera));
+        }
+        let views: Vec<&View> = aligned.iter().collect();
+        let scores = self.evaluate(&views, device, |_, _| {})?;
+        let cameras = aligned.iter().map(View::camera).collect();
+        Ok(AlignedScores { scores, cameras })
     }
 
     /// The first hook of this type, in its trained state.

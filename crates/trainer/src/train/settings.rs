@@ -10,6 +10,8 @@ use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale};
 
 use splat_data::text::{one_line, utf8};
 
+use crate::calibration::CalibrationSettings;
+
 /// Larger files are refused: parsing one could exhaust memory.
 const LONGEST: usize = 1 << 20;
 /// Beyond this, images shrink to nothing.
@@ -74,6 +76,8 @@ pub struct TrainSettings {
     pub density: AdcSettings,
     /// The strategy `mcmc`. Where `max_gaussians` is absent, growth ends as it does for `density`.
     pub mcmc: McmcSettings,
+    /// Refinement of the cameras. Default none.
+    pub calibration: CalibrationSettings,
 }
 
 /// A strategy of this crate.
@@ -115,6 +119,7 @@ impl Default for TrainSettings {
             learning_rates: LearningRates::default(),
             density: AdcSettings::default(),
             mcmc: McmcSettings::default(),
+            calibration: CalibrationSettings::default(),
         }
     }
 }
@@ -222,6 +227,8 @@ impl TrainSettings {
             );
         }
         (self.mcmc.validate()).map_err(|problem| problem.replacen('`', "`mcmc.", 1))?;
+        (self.calibration.validate())
+            .map_err(|problem| problem.replacen('`', "`calibration.", 1))?;
         if let Some(color) = self.background
             && !color.iter().all(|channel| channel.is_finite())
         {

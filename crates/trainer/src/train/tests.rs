@@ -1,5 +1,6 @@
 //! Runs on the example capture.
 
+mod calibration;
 mod extensions;
 mod strategies;
 

@@ -25,7 +25,7 @@ use super::{
     views, warnings,
 };
 use crate::hooks::{HookView, Purpose};
-use crate::photo::pixels_u8;
+use crate::photo::{mask, pixels_u8};
 
 /// A training run.
 ///
@@ -225,7 +225,8 @@ impl<M: SplatModel> Trainer<M> {
         let rendered = hooks.image(&hook_view, rendered)?;
         drop(render);
         let pixels = trace_span!("photo").in_scope(|| pixels_u8(&view, &self.device));
-        let target = TargetView::new(&view.name, pixels, &cameras, at.step);
+        let target = TargetView::new(&view.name, pixels, &cameras, at.step)
+            .with_mask(mask(&view, &self.device));
         let evaluated = trace_span!("loss").in_scope(|| self.loss.evaluate(&target, &rendered))?;
         let Some((mut loss, mut terms)) = evaluated else {
             return Err(TrainError::Loss("has no term"));

@@ -142,6 +142,7 @@ fn rendered_model(
     let cameras = CameraTensors {
         viewmats: tensor(&inputs.viewmat).reshape([1, 4, 4]),
         intrinsics: tensor(&inputs.intrinsics).reshape([1, 4]),
+        distortion: None,
         size: scene.size,
     };
     let background = &inputs.background.values;

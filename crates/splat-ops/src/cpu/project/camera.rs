@@ -1,22 +1,62 @@
-//! One camera: its projection of a point, and the gradient of that. Another camera model replaces
-//! this file.
+//! One camera: its projection of a point, and the gradient of that. What differs between camera
+//! models is a [`Lens`].
 
 use super::super::math::*;
 use super::super::real::Real;
 use crate::settings::ProjectArgs;
 
+/// Most coefficients that a lens has.
+pub(super) const COEFFICIENTS: usize = 8;
+
 /// A point in a camera, with the camera linearised there.
-pub(super) struct Sight<T> {
+#[derive(Clone, Copy)]
+pub(super) struct Sight<T, K> {
     /// Position in camera space.
     pub(super) p: Vec3<T>,
+    /// Position in the image, in pixels.
     pub(super) mean: [T; 2],
-    /// x/z and y/z, clamped; and whether they were inside the clamp.
-    u: T,
-    v: T,
-    u_inside: bool,
-    v_inside: bool,
+    /// By which splats are culled and sorted.
+    pub(super) depth: T,
+    /// True if the lens is defined there.
+    pub(super) inside: bool,
     /// J W.
     pub(super) jw: Mat23<T>,
+    /// What the gradient of the lens needs besides.
+    pub(super) kept: K,
+}
+
+/// Gradients of a lens through one point, and of that point in camera space.
+pub(super) struct LensGradient<T> {
+    pub(super) p: Vec3<T>,
+    /// Gradient of W through J W.
+    pub(super) w: Mat3<T>,
+    /// Gradients of fx, fy, cx, cy.
+    pub(super) intrinsics: [T; 4],
+    /// Gradients of the coefficients; zero beyond their number.
+    pub(super) coefficients: [T; COEFFICIENTS],
+}
+
+/// A camera model: where a point in camera space falls in the image, linearised, and the gradient
+/// of both. Branch-free, so that a loop over points becomes SIMD code.
+pub(super) trait Lens<T: Real>: Copy + Send + Sync {
+    /// What the forward pass keeps for the gradient.
+    type Kept: Copy;
+    /// Number of coefficients.
+    const COEFFICIENTS: usize;
+
+    /// The lens of one camera.
+    fn new(intrinsics: [T; 4], coefficients: &[T], domain: &[T], args: &ProjectArgs) -> Self;
+
+    /// The point `p` as the camera sees it.
+    fn sight(camera: &Camera<T, Self>, p: Vec3<T>) -> Sight<T, Self::Kept>;
+
+    /// Gradients, from those of screen mean, depth and J W.
+    fn sight_backward(
+        camera: &Camera<T, Self>,
+        sight: &Sight<T, Self::Kept>,
+        grad: [T; 3],
+        djw: Mat23<T>,
+    ) -> LensGradient<T>;
 }
 
 /// Gradients of a camera through one point, and of that point.
@@ -27,20 +67,19 @@ pub(super) struct CameraGradient<T> {
     pub(super) t: Vec3<T>,
     /// Gradients of fx, fy, cx, cy.
     pub(super) intrinsics: [T; 4],
+    pub(super) coefficients: [T; COEFFICIENTS],
 }
 
 /// One camera, in the precision of the op.
-pub(super) struct Camera<T> {
+pub(super) struct Camera<T, L> {
     /// World to camera, 3x3 block.
-    w: Mat3<T>,
-    t: Vec3<T>,
-    fx: T,
-    fy: T,
-    cx: T,
-    cy: T,
-    /// Bounds of u and v in the Jacobian.
-    u: (T, T),
-    v: (T, T),
+    pub(super) w: Mat3<T>,
+    pub(super) t: Vec3<T>,
+    pub(super) fx: T,
+    pub(super) fy: T,
+    pub(super) cx: T,
+    pub(super) cy: T,
+    pub(super) lens: L,
     pub(super) width: T,
     pub(super) height: T,
     pub(super) near: T,
@@ -51,17 +90,17 @@ pub(super) struct Camera<T> {
     pub(super) reach: T,
 }
 
-impl<T: Real> Camera<T> {
-    pub(super) fn new(viewmat: &[T], intrinsics: &[T], args: &ProjectArgs) -> Self {
+impl<T: Real, L: Lens<T>> Camera<T, L> {
+    pub(super) fn new(
+        viewmat: &[T],
+        intrinsics: &[T],
+        coefficients: &[T],
+        domain: &[T],
+        args: &ProjectArgs,
+    ) -> Self {
         let row = |i: usize| [viewmat[4 * i], viewmat[4 * i + 1], viewmat[4 * i + 2]];
-        let [fx, fy, cx, cy] = [0, 1, 2, 3].map(|i| intrinsics[i]);
-        let (width, height) = (
-            T::of(args.size.width.into()),
-            T::of(args.size.height.into()),
-        );
-        let margin = T::of(args.settings.clamp_margin);
-        let bounds =
-            |f: T, c: T, side: T| (-(c + margin * side) / f, (side - c + margin * side) / f);
+        let intrinsics = [0, 1, 2, 3].map(|i| intrinsics[i]);
+        let [fx, fy, cx, cy] = intrinsics;
         Self {
             w: [row(0), row(1), row(2)],
             t: [viewmat[3], viewmat[7], viewmat[11]],
@@ -69,10 +108,9 @@ impl<T: Real> Camera<T> {
             fy,
             cx,
             cy,
-            u: bounds(fx, cx, width),
-            v: bounds(fy, cy, height),
-            width,
-            height,
+            lens: L::new(intrinsics, coefficients, domain, args),
+            width: T::of(args.size.width.into()),
+            height: T::of(args.size.height.into()),
             near: T::of(args.settings.near),
             far: T::of(args.settings.far),
             blur: T::of(args.settings.eps2d.sqrt()),
@@ -81,31 +119,8 @@ impl<T: Real> Camera<T> {
     }
 
     #[inline(always)]
-    pub(super) fn sight(&self, mean: Vec3<T>) -> Sight<T> {
-        let p = add(apply(&self.w, mean), self.t);
-        let [x, y, z] = p;
-        let (x_z, y_z) = (x / z, y / z);
-        let u = x_z.greatest(self.u.0).least(self.u.1);
-        let v = y_z.greatest(self.v.0).least(self.v.1);
-        let jw: Mat23<T> = [
-            add(
-                scale(self.w[0], self.fx / z),
-                scale(self.w[2], -self.fx * u / z),
-            ),
-            add(
-                scale(self.w[1], self.fy / z),
-                scale(self.w[2], -self.fy * v / z),
-            ),
-        ];
-        Sight {
-            p,
-            mean: [self.fx * x_z + self.cx, self.fy * y_z + self.cy],
-            u,
-            v,
-            u_inside: (x_z >= self.u.0) & (x_z <= self.u.1),
-            v_inside: (y_z >= self.v.0) & (y_z <= self.v.1),
-            jw,
-        }
+    pub(super) fn sight(&self, mean: Vec3<T>) -> Sight<T, L::Kept> {
+        L::sight(self, add(apply(&self.w, mean), self.t))
     }
 
     /// Gradients, from those of screen mean, depth and J W of the point at `mean`.
@@ -113,61 +128,18 @@ impl<T: Real> Camera<T> {
     pub(super) fn sight_backward(
         &self,
         mean: Vec3<T>,
-        s: &Sight<T>,
+        s: &Sight<T, L::Kept>,
         grad: [T; 3],
         djw: Mat23<T>,
     ) -> CameraGradient<T> {
-        // J W -> J, W.
-        let [_, _, z] = s.p;
-        let (fx, fy) = (self.fx, self.fy);
-        let dj11 = dot(djw[0], self.w[0]);
-        let dj13 = dot(djw[0], self.w[2]);
-        let dj22 = dot(djw[1], self.w[1]);
-        let dj23 = dot(djw[1], self.w[2]);
-        let mut dw = [
-            scale(djw[0], fx / z),
-            scale(djw[1], fy / z),
-            add(scale(djw[0], -fx * s.u / z), scale(djw[1], -fy * s.v / z)),
-        ];
-
-        // J -> fx, fy, u, v, z.
-        let mut dfx = (dj11 - dj13 * s.u) / z;
-        let mut dfy = (dj22 - dj23 * s.v) / z;
-        let (mut dcx, mut dcy) = (grad[0], grad[1]);
-        let du = -dj13 * fx / z;
-        let dv = -dj23 * fy / z;
-        let mut dz = grad[2] - (fx * (dj11 - dj13 * s.u) + fy * (dj22 - dj23 * s.v)) / (z * z);
-
-        // Screen mean (not clamped) -> x/z, y/z.
-        let (x_z, y_z) = (s.p[0] / z, s.p[1] / z);
-        dfx += grad[0] * x_z;
-        dfy += grad[1] * y_z;
-        let (mut dx_z, mut dy_z) = (grad[0] * fx, grad[1] * fy);
-
-        // Inside the clamp the gradient passes; outside, u = const / fx - cx / fx depends on the
-        // camera only.
-        if s.u_inside {
-            dx_z += du;
-        } else {
-            dcx -= du / fx;
-            dfx -= du * s.u / fx;
-        }
-        if s.v_inside {
-            dy_z += dv;
-        } else {
-            dcy -= dv / fy;
-            dfy -= dv * s.v / fy;
-        }
-        dz -= (dx_z * x_z + dy_z * y_z) / z;
-
+        let g = L::sight_backward(self, s, grad, djw);
         // p = W mean + t.
-        let dp = [dx_z / z, dy_z / z, dz];
-        dw = add3(&dw, &outer(dp, mean));
         CameraGradient {
-            mean: apply_transposed(&self.w, dp),
-            w: dw,
-            t: dp,
-            intrinsics: [dfx, dfy, dcx, dcy],
+            mean: apply_transposed(&self.w, g.p),
+            w: add3(&g.w, &outer(g.p, mean)),
+            t: g.p,
+            intrinsics: g.intrinsics,
+            coefficients: g.coefficients,
         }
     }
 }

@@ -3,7 +3,7 @@
 
 use super::super::math::*;
 use super::super::real::Real;
-use super::camera::{Camera, CameraGradient};
+use super::camera::{Camera, CameraGradient, Lens};
 use super::splat::{Gaussian, Splat};
 
 /// Gradients of one (camera, Gaussian) pair.
@@ -16,10 +16,10 @@ pub(super) struct Gradient<T> {
 
 /// From the gradient of the first seven columns of [`Splat::packed`]; the extents carry none.
 #[inline(always)]
-pub(super) fn splat_backward<T: Real>(
+pub(super) fn splat_backward<T: Real, L: Lens<T>>(
     g: Gaussian<T>,
-    camera: &Camera<T>,
-    s: &Splat<T>,
+    camera: &Camera<T, L>,
+    s: &Splat<T, L::Kept>,
     grad: [T; 7],
 ) -> Gradient<T> {
     let half = T::of(0.5);

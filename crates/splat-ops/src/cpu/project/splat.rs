@@ -5,7 +5,7 @@ use splat_core::SPLAT_SIZE_MAX;
 
 use super::super::math::*;
 use super::super::real::Real;
-use super::camera::{Camera, Sight};
+use super::camera::{Camera, Lens, Sight};
 use crate::backend::PROJECTED_WIDTH;
 
 /// One Gaussian.
@@ -17,10 +17,10 @@ pub(super) struct Gaussian<T> {
 }
 
 /// Intermediate values of the forward pass, recomputed in the backward pass.
-pub(super) struct Splat<T> {
+pub(super) struct Splat<T, K> {
     /// True if not culled; if culled, all other fields are unspecified.
     pub(super) visible: bool,
-    pub(super) sight: Sight<T>,
+    pub(super) sight: Sight<T, K>,
     pub(super) unit: [T; 4],
     pub(super) length: T,
     pub(super) rotation: Mat3<T>,
@@ -47,12 +47,12 @@ pub(super) struct Splat<T> {
     pub(super) packed: [T; PROJECTED_WIDTH],
 }
 
-impl<T: Real> Splat<T> {
+impl<T: Real, K: Copy> Splat<T, K> {
     /// Comparisons are written so that NaN culls.
     #[inline(always)]
-    pub(super) fn new(g: Gaussian<T>, camera: &Camera<T>) -> Self {
+    pub(super) fn new<L: Lens<T, Kept = K>>(g: Gaussian<T>, camera: &Camera<T, L>) -> Self {
         let sight = camera.sight(g.mean);
-        let (jw, [.., z]) = (sight.jw, sight.p);
+        let Sight { jw, depth, .. } = sight;
         let (unit, length, turns) = normalize_quat(g.quat);
         let rotation = rotation(unit);
 
@@ -90,7 +90,7 @@ impl<T: Real> Splat<T> {
         let packed = [
             mean[0],
             mean[1],
-            z,
+            depth,
             w11 / k,
             w21 / k,
             w22 / k,
@@ -103,7 +103,8 @@ impl<T: Real> Splat<T> {
             & (mean[0] - extent[0] < camera.width)
             & (mean[1] + extent[1] > T::ZERO)
             & (mean[1] - extent[1] < camera.height);
-        let mut visible = reaches & turns & (z >= camera.near) & (z <= camera.far);
+        let in_depth = (depth >= camera.near) & (depth <= camera.far);
+        let mut visible = reaches & turns & in_depth & sight.inside;
         for value in packed {
             visible &= value.is_finite();
         }

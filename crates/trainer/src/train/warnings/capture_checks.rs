@@ -81,8 +81,9 @@ impl Outlook {
     fn of(view: &View, positions: &[DVec3]) -> Self {
         let center = view.camera().position();
         let distances: Vec<f64> = positions.iter().map(|p| p.distance(center)).collect();
+        let project = view.projection();
         let seen = |position: &&DVec3| {
-            let Some(([x, y], _)) = view.project(position.to_array()) else {
+            let Some(([x, y], _)) = project(position.to_array()) else {
                 return false;
             };
             let inside = |at: f64, side: u32| at > 0.0 && at < f64::from(side);

@@ -1,0 +1,102 @@
+//! Poses of the training views, refined with the scene.
+
+use burn::module::{Module, Param};
+use burn::tensor::{Device, Gradients, Tensor};
+use splat_model::optimizer::{SplatAdam, StateRecord};
+use splat_model::strategy::StepInfo;
+use splat_model::{Camera, CameraTensors, FieldStep, Optimized, SceneScale};
+use splat_ops::OpError;
+
+use super::CalibrationSettings;
+use super::motion::{MOTION, moved, moved_f64};
+use crate::{Hook, HookView};
+
+#[derive(Module, Debug)]
+struct Motions {
+    /// `[views, 6]`: a rotation vector, and a translation in sizes of the scene.
+    motions: Param<Tensor<2>>,
+}
+
+/// Refines the pose of every training view by gradients of the loss, as gsplat's pose optimisation
+/// does: a rigid motion per view in the camera's own axes, zero at first, stepped by Adam with a
+/// rate that falls exponentially.
+///
+/// Held-out views are left as they are, since nothing was learned about them; see
+/// [`align_pose`](super::align_pose).
+pub struct RefinePoses {
+    motions: Optimized<Motions>,
+    settings: CalibrationSettings,
+    scene: SceneScale,
+}
+
+impl RefinePoses {
+    /// Poses of this many training views, on a device.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn new(
+        views: usize,
+        scene: SceneScale,
+        settings: CalibrationSettings,
+        device: &Device,
+    ) -> Result<Self, OpError> {
+        let device = device.clone().without_autodiff().autodiff();
+        let motions = Motions {
+            motions: Param::from_tensor(Tensor::zeros([views, MOTION], &device)),
+        };
+        let rate = settings.pose_rate;
+        Ok(Self {
+            motions: Optimized::of_module(motions, rate, |_| SplatAdam::new().into())?,
+            settings,
+            scene,
+        })
+    }
+
+    /// Cameras of training views, in their order, after what was refined so far.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn refined(&self, cameras: &[Camera]) -> Result<Vec<Camera>, OpError> {
+        let [motions] = self.motions.read_f64(["motions"])?;
+        let motions = motions.as_chunks::<MOTION>().0;
+        let moved = |(camera, motion): (&Camera, &[f64; MOTION])| Camera {
+            viewmat: moved_f64(camera.viewmat, *motion, self.scene.length()),
+            ..*camera
+        };
+        Ok(cameras.iter().zip(motions).map(moved).collect())
+    }
+}
+
+impl Hook for RefinePoses {
+    fn name(&self) -> &str {
+        "poses"
+    }
+
+    fn cameras(
+        &self,
+        view: &HookView,
+        mut cameras: CameraTensors,
+    ) -> Result<CameraTensors, OpError> {
+        let Some(index) = view.training_index else {
+            return Ok(cameras);
+        };
+        let motion = self.motions.model().motions.val().narrow(0, index, 1);
+        cameras.viewmats = moved(cameras.viewmats, motion, self.scene.length());
+        Ok(cameras)
+    }
+
+    fn step(&mut self, gradients: &mut Gradients, at: &StepInfo) -> Result<(), OpError> {
+        let gradients = self.motions.gradients(gradients);
+        let rate = self.settings.pose_rate * self.settings.decay(at.step, at.run.steps);
+        self.motions
+            .step(gradients, |_| (rate, FieldStep::Step(1.0)))
+    }
+
+    fn save(&self) -> Result<StateRecord, OpError> {
+        self.motions.save()
+    }
+
+    fn restore(&mut self, record: StateRecord, device: &Device) -> Result<(), String> {
+        self.motions.restore(record, device)
+    }
+}

@@ -1,0 +1,89 @@
+//! Settings of self-calibration.
+
+use derive_setters::Setters;
+use serde::{Deserialize, Serialize};
+
+/// Which of the cameras' parameters are refined, and how fast.
+///
+/// The rates are Adam's. A view takes part in one step of many, and its moments carry each of its
+/// gradients on through the steps between, so that a pose moves by about the rate times the root of
+/// the number of views per visit.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, Setters)]
+#[serde(default, deny_unknown_fields)]
+#[setters(prefix = "with_")]
+pub struct CalibrationSettings {
+    /// Refine the pose of every training view. Default false.
+    pub poses: bool,
+    /// Refine focal lengths, principal points and distortion, one set for all views that begin with
+    /// the same. Default false.
+    pub intrinsics: bool,
+    /// Rate of poses: radians for rotations, sizes of the scene for translations. Default 1e-4;
+    /// gsplat has 1e-5, which corrects a fraction of a degree.
+    pub pose_rate: f64,
+    /// Rate of the logarithms of focal lengths. Default 1e-4.
+    pub focal_rate: f64,
+    /// Rate of principal points, in sides of the photo. Default 1e-4.
+    pub principal_rate: f64,
+    /// Rate of distortion coefficients. Default 3e-4.
+    pub distortion_rate: f64,
+    /// All rates fall exponentially to this share of themselves at the end of the run. Default
+    /// 0.01 (gsplat).
+    pub final_share: f64,
+    /// Steps that align the pose of a held-out view with the finished scene, for its second score.
+    /// Default 200.
+    pub align_steps: usize,
+}
+
+impl CalibrationSettings {
+    /// The defaults; `with_*` methods change them one by one.
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// True if anything is refined.
+    pub fn is_on(&self) -> bool {
+        self.poses || self.intrinsics
+    }
+
+    /// The factor of all rates at a step.
+    pub(crate) fn decay(&self, step: usize, steps: usize) -> f64 {
+        self.final_share.powf(step as f64 / steps.max(1) as f64)
+    }
+
+    /// Checks that the settings can be used.
+    ///
+    /// # Errors
+    /// The field and why its value cannot be used, in one line.
+    pub fn validate(&self) -> Result<(), String> {
+        let rates = [
+            ("pose_rate", self.pose_rate),
+            ("focal_rate", self.focal_rate),
+            ("principal_rate", self.principal_rate),
+            ("distortion_rate", self.distortion_rate),
+        ];
+        let usable = |value: f64| value.is_finite() && (0.0..=1.0).contains(&value);
+        if let Some((field, value)) = rates.iter().find(|(_, value)| !usable(*value)) {
+            return Err(format!("`{field}` must lie in [0, 1], it is {value}"));
+        }
+        let share = self.final_share;
+        if !(share > 0.0 && share <= 1.0) {
+            return Err(format!("`final_share` must lie in (0, 1], it is {share}"));
+        }
+        Ok(())
+    }
+}
+
+impl Default for CalibrationSettings {
+    fn default() -> Self {
+        Self {
+            poses: false,
+            intrinsics: false,
+            pose_rate: 1e-4,
+            focal_rate: 1e-4,
+            principal_rate: 1e-4,
+            distortion_rate: 3e-4,
+            final_share: 0.01,
+            align_steps: 200,
+        }
+    }
+}

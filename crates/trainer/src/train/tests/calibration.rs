@@ -1,0 +1,178 @@
+//! Runs that refine their cameras, and masks.
+
+use glam::{DMat4, DVec3};
+use splat_data::Lens;
+use splat_model::Camera;
+
+use super::*;
+use crate::calibration::{CalibrationSettings, RefineIntrinsics, RefinePoses, align_pose};
+
+fn settings() -> TrainSettings {
+    let calibration = CalibrationSettings::new()
+        .with_poses(true)
+        .with_intrinsics(true);
+    TrainSettings::new()
+        .with_steps(120)
+        .with_calibration(calibration)
+}
+
+fn run(steps: Option<usize>, resume: Option<Checkpoint>) -> Trained {
+    let mut builder = builder().settings(settings());
+    if let Some(checkpoint) = resume {
+        builder = builder.resume(checkpoint);
+    }
+    if let Some(steps) = steps {
+        let stop = Arc::new(AtomicBool::new(false));
+        let seen = stop.clone();
+        builder = builder.interrupt(stop).on_progress(move |progress| {
+            seen.store(progress.step >= steps, Ordering::Relaxed);
+        });
+    }
+    builder.build().unwrap().run().unwrap()
+}
+
+#[test]
+fn refined_cameras_resume_exactly() {
+    let whole = run(None, None);
+    let half = run(Some(110), None);
+    assert_eq!(half.steps, 110);
+    let resumed = run(None, Some(half.checkpoint().unwrap()));
+    let capture = capture();
+    let cameras = whole.cameras(&capture).unwrap();
+    assert_eq!(resumed.cameras(&capture).unwrap(), cameras);
+    assert_eq!(resumed.model.to_data().means, whole.model.to_data().means);
+
+    let before: Vec<Camera> = capture.views.iter().map(|view| view.camera()).collect();
+    for (index, (after, before)) in cameras.iter().zip(&before).enumerate() {
+        // A pinhole gets a lens; held-out views share it, but keep their poses.
+        assert!(matches!(after.lens, Lens::OpenCv(k) if k[0] != 0.0 && k[4] == 0.0));
+        assert_ne!(after.intrinsics, before.intrinsics);
+        let moved = after.viewmat != before.viewmat;
+        assert_eq!(moved, capture.split.train.contains(&index));
+    }
+}
+
+#[test]
+fn nothing_is_refined_that_was_not_asked_for() {
+    let trained = builder()
+        .settings(TrainSettings::new().with_steps(2))
+        .build()
+        .unwrap()
+        .run()
+        .unwrap();
+    assert!(trained.hook::<RefinePoses>().is_none());
+    assert!(trained.hook::<RefineIntrinsics>().is_none());
+    let capture = capture();
+    let before: Vec<Camera> = capture.views.iter().map(|view| view.camera()).collect();
+    assert_eq!(trained.cameras(&capture).unwrap(), before);
+}
+
+#[test]
+fn a_moved_pose_finds_its_way_back() {
+    let capture = capture();
+    let trained = builder()
+        .settings(TrainSettings::new().with_steps(400))
+        .build()
+        .unwrap()
+        .run()
+        .unwrap();
+    let scene = trained.to_data().scene_scale();
+    let view = capture.test_views().next().unwrap();
+    let camera = view.camera();
+    let turn = DMat4::from_axis_angle(DVec3::new(1.0, 2.0, -1.0).normalize(), 0.01);
+    let moved = view.with_pose(&Camera {
+        viewmat: turn * camera.viewmat,
+        ..camera
+    });
+    let (settings, device) = (&trained.render_settings, Device::flex());
+    let aligned = align_pose(&trained.model, &moved, settings, scene, &device, 150).unwrap();
+    let angle = |other: DMat4| {
+        let turn = glam::DMat3::from_mat4(other * camera.viewmat.inverse());
+        glam::DQuat::from_mat3(&turn).to_axis_angle().1
+    };
+    let (before, after) = (angle(turn * camera.viewmat), angle(aligned.viewmat));
+    assert!((before - 0.01).abs() < 1e-9);
+    assert!(after < 0.3 * before, "{after} radians are left of {before}");
+}
+
+/// What a mask hides changes neither the scene nor its scores.
+#[test]
+fn masked_pixels_count_in_no_loss_and_no_score() {
+    let masked = |value: u8| {
+        let mut capture = Capture::clone(&capture());
+        for view in &mut capture.views {
+            let (w, pixels) = (view.width as usize, (view.width * view.height) as usize);
+            let kept = |pixel: usize| pixel % w < w / 2;
+            view.mask = Some(Arc::new(
+                (0..pixels).map(|p| 255 * u8::from(kept(p))).collect(),
+            ));
+            let mut image = view.image.to_vec();
+            for (pixel, color) in image.chunks_exact_mut(3).enumerate() {
+                if !kept(pixel) {
+                    color.fill(value);
+                }
+            }
+            view.image = Arc::new(image);
+        }
+        let trainer = builder_on(Arc::new(capture.clone()));
+        let trained = trainer.settings(TrainSettings::new().with_steps(20));
+        let trained = trained.build().unwrap().run().unwrap();
+        let views: Vec<_> = capture.test_views().collect();
+        let scores = trained
+            .evaluate(&views, &Device::flex(), |_, _| {})
+            .unwrap();
+        (trained.model.to_data(), scores)
+    };
+    let (black, scores) = masked(0);
+    let (white, others) = masked(255);
+    assert_eq!(black.means, white.means);
+    assert_eq!(black.sh0, white.sh0);
+    assert_eq!(scores, others);
+    assert!(scores.psnr.is_finite());
+}
+
+#[test]
+fn settings_that_refine_nothing_sensible_are_named() {
+    let mut config = settings();
+    config.calibration.pose_rate = -1.0;
+    let error = config.validate().unwrap_err();
+    assert!(
+        error.contains("`calibration.pose_rate` must lie in [0, 1]"),
+        "{error}"
+    );
+    config.calibration.pose_rate = 0.1;
+    config.calibration.final_share = 0.0;
+    let error = config.validate().unwrap_err();
+    assert!(error.contains("`calibration.final_share`"), "{error}");
+}
+
+/// The correction of a lens reaches the render: with all corrections zero nothing changes.
+#[test]
+fn a_lens_without_distortion_renders_like_a_pinhole() {
+    let capture = capture();
+    let view = &capture.views[0];
+    let trained = builder()
+        .settings(TrainSettings::new().with_steps(30))
+        .build()
+        .unwrap()
+        .run()
+        .unwrap();
+    let image = |lens: Lens| -> Vec<f32> {
+        let mut view = view.clone();
+        view.lens = lens;
+        let mut image = Vec::new();
+        trained
+            .evaluate(&[&view], &Device::flex(), |_, pixels| image = pixels)
+            .unwrap();
+        image
+    };
+    let pinhole = image(Lens::Pinhole);
+    let bent = image(Lens::OpenCv([0.0; 8]));
+    let far = pinhole.iter().zip(&bent).map(|(a, b)| (a - b).abs());
+    // The clamp of the Jacobian is a circle here, a box there.
+    let mean = far.sum::<f32>() / pinhole.len() as f32;
+    assert!(mean < 1e-4, "{mean}");
+    let mut k = [0.0; 8];
+    k[0] = -0.2;
+    assert_ne!(image(Lens::OpenCv(k)), bent);
+}
