@@ -30,6 +30,12 @@ impl CommandLine {
         self.path(path)
     }
 
+    /// Adds an option without a value.
+    pub(super) fn flag(mut self, name: &str) -> Self {
+        self.0 += &format!(" {name}");
+        self
+    }
+
     /// The command in one line; `None` if a path contains line breaks or other control characters.
     pub(super) fn in_a_line(&self) -> Option<&str> {
         (!self.0.contains(char::is_control)).then_some(&self.0)

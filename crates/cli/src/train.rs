@@ -71,6 +71,9 @@ pub struct TrainArgs {
     /// Refine focal lengths, principal points and distortion with the scene
     #[arg(long)]
     pub refine_intrinsics: bool,
+    /// Also write the photos and cameras without distortion, for viewers that know pinholes only
+    #[arg(long)]
+    pub undistort: bool,
     /// Settings, such as the config.toml of another run; arguments win over it
     #[arg(long, value_name = "FILE")]
     pub config: Option<PathBuf>,
@@ -170,7 +173,10 @@ impl TrainArgs {
     /// The command that resumes the run in `out`. Its settings are in the checkpoint.
     fn resume_command(&self, out: &Path, global: &GlobalArgs) -> CommandLine {
         let line = CommandLine::new("train", global).path(&self.capture);
-        let line = self.images(line.option("--resume", out));
+        let mut line = self.images(line.option("--resume", out));
+        if self.undistort {
+            line = line.flag("--undistort");
+        }
         match self.autosave {
             AUTOSAVE => line,
             seconds => line.option("--autosave", seconds.to_string().as_ref()),
@@ -238,9 +244,16 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         folder: &out,
         config: &config_text,
         resume: &resume,
+        undistort: args.undistort,
         global,
     };
     folder.probe(&capture)?;
+    if let Some(there) = folder.undistorted_before() {
+        return Err(Failure::BadInput(format!(
+            "{}: there already; --undistort replaces no photos, so move it or choose another --out",
+            there.display()
+        )));
+    }
     if fresh && folder.is_taken() {
         global.say(format_args!(
             "{}: the results of an earlier run are replaced when this one ends or is interrupted",

@@ -37,6 +37,8 @@ const LOSSES: &str = "losses.csv";
 const CURVES: &str = "curves.svg";
 /// The folder of refined cameras, a COLMAP model.
 pub(super) const CAMERAS: &str = "cameras";
+/// The folder of undistorted photos with their cameras.
+const UNDISTORTED: &str = "undistorted";
 /// The pictures' folder.
 const VIEWS: &str = "views";
 
@@ -47,6 +49,8 @@ pub(super) struct RunFolder<'a> {
     pub config: &'a str,
     /// The command that resumes the run.
     pub resume: &'a CommandLine,
+    /// Whether undistorted photos are written too.
+    pub undistort: bool,
     pub global: &'a GlobalArgs,
 }
 
@@ -80,11 +84,19 @@ impl RunFolder<'_> {
         for name in [SCENE, CHECKPOINT, CONFIG, METRICS, LOSSES, CURVES] {
             probe_file(&self.folder.join(name))?;
         }
-        let views = self.folder.join(VIEWS);
-        match views.exists() {
-            true => Ok(probe_folder(&views)?),
-            false => Ok(()),
+        for name in [VIEWS, CAMERAS] {
+            let folder = self.folder.join(name);
+            if folder.exists() {
+                probe_folder(&folder)?;
+            }
         }
+        Ok(())
+    }
+
+    /// Undistorted photos of an earlier run, which are not replaced.
+    pub(super) fn undistorted_before(&self) -> Option<PathBuf> {
+        let folder = self.folder.join(UNDISTORTED);
+        (self.undistort && folder.exists()).then_some(folder)
     }
 
     /// The picture of a view.
@@ -241,7 +253,7 @@ impl RunFolder<'_> {
         chosen: &ChosenDevice,
     ) -> Option<AlignedScores> {
         let calibration = &config.calibration;
-        if !calibration.is_on() {
+        if !calibration.is_on() && !self.undistort {
             return None;
         }
         let measure = || -> Result<(Vec<View>, Option<AlignedScores>), Failure> {
@@ -272,7 +284,13 @@ impl RunFolder<'_> {
             views,
             ..capture.clone()
         };
-        saving.keep(CAMERAS, refined.save_model(&self.folder.join(CAMERAS)));
+        if calibration.is_on() {
+            saving.keep(CAMERAS, refined.save_model(&self.folder.join(CAMERAS)));
+        }
+        if self.undistort {
+            let folder = self.folder.join(UNDISTORTED);
+            saving.keep(UNDISTORTED, refined.undistorted().save(&folder));
+        }
         aligned
     }
 

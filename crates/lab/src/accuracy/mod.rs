@@ -9,6 +9,7 @@
 
 mod case;
 mod cases;
+pub mod lenses;
 mod measure;
 pub mod model_error;
 pub mod projection;
