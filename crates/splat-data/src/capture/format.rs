@@ -3,7 +3,7 @@
 use std::path::Path;
 
 use super::sparse_model::SparseModel;
-use super::{CaptureError, CaptureWarning};
+use super::{CaptureError, CaptureSettings, CaptureWarning};
 
 /// A model with its warnings, or the reason that there is none.
 pub(super) type ReadModel = Result<(SparseModel, Vec<CaptureWarning>), CaptureError>;
@@ -13,5 +13,5 @@ pub(super) struct CaptureFormat {
     /// True if the folder holds a capture in this format, judged by file names.
     pub is_in: fn(&Path) -> bool,
     /// Reads and checks the cameras, images and points of the folder.
-    pub read: fn(&Path) -> ReadModel,
+    pub read: fn(&Path, &CaptureSettings) -> ReadModel,
 }

@@ -2,16 +2,16 @@
 
 use std::path::Path;
 
-use super::colmap;
 use super::format::{CaptureFormat, ReadModel};
+use super::{CaptureSettings, colmap};
 
 /// All formats; the first that matches is read.
 const FORMATS: &[CaptureFormat] = &[colmap::FORMAT];
 
 /// Reads the folder in the format that matches. If none does, returns the error of the first.
-pub(super) fn read(root: &Path) -> ReadModel {
+pub(super) fn read(root: &Path, settings: &CaptureSettings) -> ReadModel {
     let format = FORMATS.iter().find(|format| (format.is_in)(root));
-    (format.unwrap_or(&FORMATS[0]).read)(root)
+    (format.unwrap_or(&FORMATS[0]).read)(root, settings)
 }
 
 #[cfg(test)]

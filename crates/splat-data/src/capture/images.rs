@@ -8,7 +8,6 @@ use std::sync::Arc;
 
 use image::{DynamicImage, ImageError, ImageFormat, ImageReader};
 use rayon::prelude::*;
-use splat_core::Lens;
 use splat_core::memory::available_memory;
 
 use super::sparse_model::{SparseCamera, SparseImage, SparseModel};
@@ -74,7 +73,7 @@ pub(super) fn check_memory(
     };
     let of_camera = |image: &SparseImage| {
         let camera = &model.cameras[&image.camera_id];
-        bytes([camera.width, camera.height])
+        camera.intrinsics.size().map_or(u64::MAX, bytes)
     };
     let Some(left) = left else { return Ok(()) };
     // Photos may differ in size from their cameras. Looking at each takes time and is skipped if
@@ -126,8 +125,8 @@ fn load_one(
     let path = folder.join(&image.name);
     let mut file = PhotoFile::open(&path)?;
     let size = file.size(&path)?;
-    let camera_size = [camera.width, camera.height];
-    let Some(mut intrinsics) = fit_intrinsics(camera, size) else {
+    let camera_size = camera.intrinsics.size().unwrap_or(size);
+    let Some(mut intrinsics) = camera.intrinsics.fit(size) else {
         return Err(CaptureError::PhotoSize {
             path,
             photo: size,
@@ -158,10 +157,11 @@ fn load_one(
             width,
             height,
             intrinsics,
-            viewmat: image.viewmat(),
-            lens: Lens::Pinhole,
+            viewmat: image.viewmat,
+            lens: camera.lens,
             image: Arc::new(pixels),
             mask: None,
+            depth: image.depth.clone(),
         },
         transparent,
         suspect,
@@ -226,21 +226,6 @@ fn undecodable(path: &Path, error: &ImageError) -> CaptureError {
         path: path.to_path_buf(),
         reason: error.to_string().replace('\n', " "),
     }
-}
-
-/// The camera's intrinsics for a photo of `size`, or `None` if the aspect ratios differ.
-///
-/// A rescale counts as uniform if one factor explains both sides to within a pixel (sizes are
-/// rounded). Each side is then scaled by its own ratio, so that the photo's edges stay the camera's
-/// edges.
-fn fit_intrinsics(camera: &SparseCamera, size: [u32; 2]) -> Option<[f64; 4]> {
-    let [fx, fy, cx, cy] = camera.intrinsics;
-    let [w, h] = size.map(f64::from);
-    let [cam_w, cam_h] = [camera.width, camera.height].map(f64::from);
-    let least = ((w - 1.0) / cam_w).max((h - 1.0) / cam_h);
-    let most = ((w + 1.0) / cam_w).min((h + 1.0) / cam_h);
-    let (sx, sy) = (w / cam_w, h / cam_h);
-    (least <= most).then_some([fx * sx, fy * sy, cx * sx, cy * sy])
 }
 
 /// 8-bit RGB with transparent pixels composited on black; and whether there were any.

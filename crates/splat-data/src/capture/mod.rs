@@ -10,7 +10,10 @@
 
 mod colmap;
 mod colmap_binary;
+mod colmap_checks;
+mod colmap_folder;
 mod colmap_models;
+mod colmap_records;
 mod colmap_text;
 mod downscale;
 mod error;
@@ -20,9 +23,12 @@ mod images;
 #[doc(hidden)]
 pub mod in_memory;
 mod jpeg;
+mod lens_checks;
+mod random_points;
 mod save;
 mod sparse_model;
 mod split;
+mod warning;
 
 use derive_setters::Setters;
 use std::collections::HashMap;
@@ -34,8 +40,9 @@ use splat_core::{ImageSize, Lens};
 
 use crate::Camera;
 
-pub use error::{CaptureError, CaptureWarning};
+pub use error::CaptureError;
 pub use split::Split;
+pub use warning::CaptureWarning;
 
 /// A photo capture in memory: all photos with their cameras, the sparse points, and the held-out
 /// split.
@@ -49,8 +56,12 @@ pub struct Capture {
     pub photos: PathBuf,
     /// All views, sorted by [`View::name`]. Never empty.
     pub views: Vec<View>,
-    /// Points of structure from motion, in file order. Never empty.
+    /// Points of structure from motion, in file order; random ones, with a warning, if the capture
+    /// has none. Never empty.
     pub points: Vec<Point>,
+    /// Colour behind the scene, from 0 to 1, if the capture has one: white for a Blender capture,
+    /// whose transparent photos were composited on it. `None` for photos of the real world.
+    pub background: Option<[f32; 3]>,
     /// Indices into [`Capture::views`]: for training, and held out.
     pub split: Split,
     /// Problems that did not prevent reading.
@@ -78,6 +89,8 @@ pub struct View {
     pub image: Arc<Vec<u8>>,
     /// Which pixels count, `width * height` bytes from 0 (ignored) to 255; `None` if all do.
     pub mask: Option<Arc<Vec<u8>>>,
+    /// The depth map that the capture names, if any. It exists, and is not read here.
+    pub depth: Option<PathBuf>,
 }
 
 /// A point of structure from motion.
@@ -147,9 +160,16 @@ impl Capture {
         if options.downscale == 0 {
             return Err(CaptureError::ZeroDownscale);
         }
-        let (model, mut warnings) = formats::read(root)?;
+        let (mut model, mut warnings) = formats::read(root, options)?;
         let photos = images::folder(root, &model, options)?;
         let views = images::load(root, &photos, &model, options, &mut warnings)?;
+        warnings.extend(lens_checks::fold_back(&model, &views));
+        if model.points.is_empty() {
+            let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
+            let room = random_points::Room::of_cameras(&cameras);
+            model.points = random_points::draw(room, random_points::COUNT);
+            warnings.push(room.warning());
+        }
         let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
         let split = Split::of_capture(root, &names, &mut warnings)?;
         Ok(Self {
@@ -158,6 +178,7 @@ impl Capture {
             photos,
             split,
             points: model.points,
+            background: None,
             views,
             warnings,
         })
@@ -210,6 +231,11 @@ impl Capture {
 }
 
 impl View {
+    /// Number of pixels.
+    pub(crate) fn pixel_count(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
     /// Camera of the view.
     pub fn camera(&self) -> Camera {
         let [r0, r1, r2, r3] = self.viewmat.map(DVec4::from_array);
@@ -251,6 +277,7 @@ impl View {
             lens: self.lens,
             image: Arc::new(image),
             mask: None,
+            depth: self.depth.clone(),
         }
     }
 

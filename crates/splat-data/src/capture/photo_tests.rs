@@ -48,13 +48,14 @@ fn photos_that_memory_cannot_hold_are_refused_before_they_are_read() {
     let (root, _) = good();
     let capture = load(root.path()).unwrap();
     let bytes: u64 = capture.views.iter().map(|v| v.image.len() as u64).sum();
-    let (mut model, _) = colmap::read(root.path()).unwrap();
+    let (mut model, _) = colmap::read(root.path(), &CaptureSettings::new()).unwrap();
     let check = |model: &sparse_model::SparseModel, factor: u32, left: Option<u64>| {
         let folder = root.path().join("images");
         images::check_memory(root.path(), &folder, model, factor, left)
     };
     for camera in model.cameras.values_mut() {
-        (camera.width, camera.height) = (u32::MAX, u32::MAX);
+        let sparse_model::Intrinsics::Pixels { size, .. } = &mut camera.intrinsics;
+        *size = [u32::MAX; 2];
     }
     assert!(check(&model, 1, Some(bytes)).is_ok());
     assert!(check(&model, 1, None).is_ok());
