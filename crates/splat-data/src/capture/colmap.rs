@@ -15,6 +15,7 @@ use super::{CaptureError, CaptureSettings, CaptureWarning, colmap_binary, colmap
 /// A folder with a COLMAP model in a numbered folder of `sparse`, in `sparse`, or in the folder
 /// itself.
 pub(super) const FORMAT: CaptureFormat = CaptureFormat {
+    name: "the COLMAP model",
     is_in: |root| !candidates(root).is_empty(),
     read,
 };

@@ -62,6 +62,7 @@ pub(super) fn assemble(
         cameras: by_id.into_iter().map(|(id, c)| (id, sparse(c))).collect(),
         images: images.into_iter().map(image).collect(),
         points,
+        ..SparseModel::default()
     })
 }
 

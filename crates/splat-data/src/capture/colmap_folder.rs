@@ -9,15 +9,6 @@ use super::{CaptureError, CaptureWarning, colmap_binary, colmap_text};
 /// The folder that holds the model. COLMAP writes every connected part of a reconstruction to a
 /// numbered folder of `sparse`; the one with the most images is read.
 pub(super) fn find(root: &Path) -> Result<(PathBuf, Vec<CaptureWarning>), CaptureError> {
-    let metadata = root.metadata().map_err(|source| CaptureError::Io {
-        path: root.to_path_buf(),
-        source,
-    })?;
-    if !metadata.is_dir() {
-        return Err(CaptureError::NotAFolder {
-            path: root.to_path_buf(),
-        });
-    }
     let mut folders = candidates(root);
     if folders.len() < 2 {
         let no_model = || CaptureError::NoModel {
@@ -94,8 +85,8 @@ pub(super) struct ModelFiles {
 }
 
 impl ModelFiles {
-    /// The binary files if cameras and images are present, else the text files; otherwise names the missing one of
-    /// the encoding that has the cameras.
+    /// The binary files if cameras and images are present, else the text files; otherwise names the
+    /// missing one of the encoding that has the cameras.
     pub fn find(folder: &Path) -> Result<Self, CaptureError> {
         let [binary, text] = [true, false].map(|binary| Self::of(folder, binary));
         match (binary.missing(), text.missing()) {

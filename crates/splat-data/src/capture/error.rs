@@ -18,7 +18,7 @@ pub enum CaptureError {
         source: std::io::Error,
     },
     /// The capture's path is not a folder.
-    #[error("{}: not a folder; a capture is a folder with `images/` and `sparse/0/`", path.display())]
+    #[error("{}: neither a folder nor a .json file; a capture is a folder with `images/` and `sparse/0/`, or with `transforms.json`", path.display())]
     NotAFolder {
         /// The path given.
         path: PathBuf,
@@ -98,6 +98,29 @@ pub enum CaptureError {
         /// The reason.
         reason: String,
     },
+    /// A `transforms.json` that is none.
+    #[error("{}: {reason}", path.display())]
+    BadTransforms {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        reason: String,
+    },
+    /// Most photos of a `transforms.json` do not exist.
+    #[error(
+        "{}: {missing} of its {frames} frames have no photo, from {}; restore the photos, or name their folder with --images",
+        path.display(), first.display()
+    )]
+    MissingPhotos {
+        /// The file with the frames.
+        path: PathBuf,
+        /// Number of frames without a photo.
+        missing: usize,
+        /// Number of frames.
+        frames: usize,
+        /// The first photo that does not exist.
+        first: PathBuf,
+    },
     /// A camera model that is not implemented.
     #[error(
         "{}: camera {camera_id} has the camera model {model}, which cannot be read: {remedy}",
@@ -166,7 +189,7 @@ pub enum CaptureError {
         reason: String,
     },
     /// A photo that cannot be decoded.
-    #[error("{}: cannot be decoded as JPEG or PNG: {reason}", path.display())]
+    #[error("{}: cannot be decoded as JPEG, PNG, WebP or TIFF: {reason}", path.display())]
     UndecodablePhoto {
         /// The photo.
         path: PathBuf,
@@ -209,6 +232,21 @@ pub enum CaptureError {
         camera_id: u32,
         /// The camera's width and height.
         camera: [u32; 2],
+    },
+    /// A mask that differs in size from its photo.
+    #[error(
+        "{}: the mask is {}x{} pixels, but its photo {} is {}x{}; rescale the mask to the photo's size, or use the photos it was made for",
+        mask.display(), mask_size[0], mask_size[1], photo.display(), photo_size[0], photo_size[1]
+    )]
+    MaskSize {
+        /// The mask.
+        mask: PathBuf,
+        /// Its width and height.
+        mask_size: [u32; 2],
+        /// The photo.
+        photo: PathBuf,
+        /// Its width and height.
+        photo_size: [u32; 2],
     },
     /// A photo too small for SSIM.
     #[error(

@@ -1,13 +1,16 @@
 //! A capture of grey photos from the contents of a model's files, for callers without a folder:
 //! fuzz targets and their regression tests.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use super::colmap;
 use super::random_points::Room;
-use super::sparse_model::{Intrinsics, SparseImage, SparseModel};
-use super::{Capture, CaptureError, Split, View, images, random_points};
+use super::sparse_model::{SparseImage, SparseModel};
+use super::{
+    Capture, CaptureError, CaptureWarning, Point, Split, View, images, points_file, random_points,
+    transforms,
+};
 use crate::Camera;
 
 /// Photos have the size of their camera, up to this limit.
@@ -20,13 +23,34 @@ const FEW_POINTS: usize = 16;
 /// # Errors
 /// Those of the readers, see [`CaptureError`].
 pub fn parse(binary: bool, files: [&[u8]; 3]) -> Result<Capture, CaptureError> {
-    let (mut model, warnings) = colmap::parse_model(binary, files)?;
+    colmap::parse_model(binary, files).map(capture)
+}
+
+/// Reads and checks a `transforms.json`, or a file of Blender's with another name, from its
+/// contents.
+///
+/// # Errors
+/// Those of the reader, see [`CaptureError`].
+pub fn parse_transforms(name: &str, contents: &[u8]) -> Result<Capture, CaptureError> {
+    transforms::parse_model(Path::new(name), contents).map(capture)
+}
+
+/// Reads the points of a PLY file from its contents.
+///
+/// # Errors
+/// Those of the reader, see [`CaptureError`].
+pub fn parse_points(name: &str, contents: &[u8]) -> Result<Vec<Point>, CaptureError> {
+    points_file::parse(Path::new(name), contents)
+}
+
+fn capture((mut model, warnings): (SparseModel, Vec<CaptureWarning>)) -> Capture {
     let views: Vec<View> = model.images.iter().map(|i| view(&model, i)).collect();
     if model.points.is_empty() {
         let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
-        model.points = random_points::draw(Room::of_cameras(&cameras), FEW_POINTS);
+        let room = model.room.unwrap_or_else(|| Room::of_cameras(&cameras));
+        model.points = random_points::draw(room, FEW_POINTS);
     }
-    Ok(Capture {
+    Capture {
         name: "memory".into(),
         root: PathBuf::from("memory"),
         photos: PathBuf::from("memory"),
@@ -36,21 +60,23 @@ pub fn parse(binary: bool, files: [&[u8]; 3]) -> Result<Capture, CaptureError> {
         },
         views,
         points: model.points,
-        background: None,
+        background: model.background,
         warnings,
-    })
+    }
 }
 
 fn view(model: &SparseModel, image: &SparseImage) -> View {
     let camera = &model.cameras[&image.camera_id];
     let side = |length: u32| length.clamp(images::MIN_SIDE, LARGEST_SIDE);
-    let Intrinsics::Pixels { size, values } = camera.intrinsics;
+    let size = camera.intrinsics.size().unwrap_or([LARGEST_SIDE; 2]);
     let [width, height] = size.map(side);
+    // As for photos of another size, but with any aspect ratio.
+    let intrinsics = camera.intrinsics.fit(size).unwrap_or([1.0; 4]);
     View {
         name: image.name.clone(),
         width,
         height,
-        intrinsics: values,
+        intrinsics,
         viewmat: image.viewmat,
         lens: camera.lens,
         image: Arc::new(vec![128; 3 * width as usize * height as usize]),

@@ -8,9 +8,9 @@ use super::{CaptureWarning, View};
 /// Pixels along each side at which a lens is tried.
 const TRIED: u32 = 33;
 
-/// Cameras that see nothing at a corner of their photos: their calibration was fitted to the middle,
-/// and folds back before the border, or the photo is the round one of a fisheye. A splat falls on no
-/// such pixel, whatever training does. The views are those of the model's images.
+/// Cameras that see nothing at a corner of their photos: their calibration was fitted to the
+/// middle, and folds back before the border, or the photo is the round one of a fisheye. A splat
+/// falls on no such pixel, whatever training does. The views are those of the model's images.
 pub(super) fn fold_back(model: &SparseModel, views: &[View]) -> Option<CaptureWarning> {
     let mut seen = HashSet::new();
     let mut first = None;

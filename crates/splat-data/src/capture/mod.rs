@@ -24,10 +24,14 @@ mod images;
 pub mod in_memory;
 mod jpeg;
 mod lens_checks;
+mod masks;
+mod photo_file;
+mod points_file;
 mod random_points;
 mod save;
 mod sparse_model;
 mod split;
+mod transforms;
 mod warning;
 
 use derive_setters::Setters;
@@ -39,6 +43,7 @@ use glam::{DMat4, DVec4};
 use splat_core::{ImageSize, Lens};
 
 use crate::Camera;
+use random_points::Room;
 
 pub use error::CaptureError;
 pub use split::Split;
@@ -67,6 +72,9 @@ pub struct Capture {
     /// Problems that did not prevent reading.
     pub warnings: Vec<CaptureWarning>,
 }
+
+/// Is told the number of photos that are done, and of all.
+type Progress<'a> = &'a (dyn Fn(usize, usize) + Sync);
 
 /// One photo and the camera that took it.
 #[derive(Debug, Clone)]
@@ -156,29 +164,66 @@ impl Capture {
     /// [`CaptureError`] if the capture is unusable. A capture of a single photo can be read;
     /// [`Capture::check_trainable`] decides whether it can be trained.
     pub fn load(root: impl AsRef<Path>, options: &CaptureSettings) -> Result<Self, CaptureError> {
-        let root = root.as_ref();
+        Self::load_with_progress(root, options, &|_, _| {})
+    }
+
+    /// [`Capture::load`], which calls `progress` with the number of photos that are decoded and
+    /// that of all photos, after each of them and from several threads.
+    ///
+    /// ```
+    /// use std::sync::atomic::{AtomicUsize, Ordering};
+    ///
+    /// use splat_data::{Capture, CaptureSettings};
+    ///
+    /// # let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
+    /// let calls = AtomicUsize::new(0);
+    /// let progress = |done: usize, total: usize| {
+    ///     assert!(done <= total);
+    ///     calls.fetch_add(1, Ordering::Relaxed);
+    /// };
+    /// let options = CaptureSettings::new().with_downscale(16);
+    /// let capture = Capture::load_with_progress(folder, &options, &progress)?;
+    /// assert_eq!(calls.into_inner(), capture.views.len());
+    /// # Ok::<(), splat_data::CaptureError>(())
+    /// ```
+    ///
+    /// # Errors
+    ///
+    /// Those of [`Capture::load`].
+    pub fn load_with_progress(
+        root: impl AsRef<Path>,
+        options: &CaptureSettings,
+        progress: &(dyn Fn(usize, usize) + Sync),
+    ) -> Result<Self, CaptureError> {
         if options.downscale == 0 {
             return Err(CaptureError::ZeroDownscale);
         }
-        let (mut model, mut warnings) = formats::read(root, options)?;
+        let (mut model, mut warnings) = formats::read(root.as_ref(), options)?;
+        let root = match root.as_ref() {
+            file if file.is_file() => match file.parent() {
+                Some(folder) if !folder.as_os_str().is_empty() => folder,
+                _ => Path::new("."),
+            },
+            folder => folder,
+        };
         let photos = images::folder(root, &model, options)?;
-        let views = images::load(root, &photos, &model, options, &mut warnings)?;
+        let views = images::load(root, &photos, &model, options, progress, &mut warnings)?;
         warnings.extend(lens_checks::fold_back(&model, &views));
         if model.points.is_empty() {
             let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
-            let room = random_points::Room::of_cameras(&cameras);
+            let room = model.room.unwrap_or_else(|| Room::of_cameras(&cameras));
             model.points = random_points::draw(room, random_points::COUNT);
             warnings.push(room.warning());
         }
         let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
-        let split = Split::of_capture(root, &names, &mut warnings)?;
+        let split = Split::of_capture(root, &names, model.split.as_ref(), &mut warnings)?;
         Ok(Self {
             name: folder_name(root),
             root: root.to_path_buf(),
             photos,
             split,
             points: model.points,
-            background: None,
+            background: model.background,
             views,
             warnings,
         })
@@ -266,17 +311,22 @@ impl View {
         if factor <= 1 {
             return self.clone();
         }
-        let (image, width, height) =
-            downscale::area_average(&self.image, self.width, self.height, factor);
+        let whole = downscale::Picture {
+            pixels: &self.image,
+            mask: self.mask.as_ref().map(|mask| mask.as_slice()),
+            width: self.width,
+            height: self.height,
+        };
+        let (image, mask) = downscale::area_average(&whole, factor);
         Self {
             name: self.name.clone(),
-            width,
-            height,
+            width: self.width / factor,
+            height: self.height / factor,
             intrinsics: downscale::intrinsics(self.intrinsics, factor),
             viewmat: self.viewmat,
             lens: self.lens,
             image: Arc::new(image),
-            mask: None,
+            mask: mask.map(Arc::new),
             depth: self.depth.clone(),
         }
     }
@@ -303,6 +353,8 @@ fn folder_name(root: &Path) -> String {
         .unwrap_or_else(|| "capture".to_owned())
 }
 
+#[cfg(test)]
+mod mask_tests;
 #[cfg(test)]
 mod photo_tests;
 #[cfg(test)]

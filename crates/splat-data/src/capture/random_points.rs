@@ -27,9 +27,9 @@ impl Room {
     /// The cube about the point nearest to all optical axes, in the sense of least squares, up to
     /// the median distance of the cameras.
     ///
-    /// Where the axes are nearly parallel, or meet behind most cameras, no such point is meaningful.
-    /// The cube then begins at the middle of the cameras and extends in their mean direction by
-    /// twice their spread, or 1 if that is zero.
+    /// Where the axes are nearly parallel, or meet behind most cameras, no such point is
+    /// meaningful. The cube then begins at the middle of the cameras and extends in their mean
+    /// direction by twice their spread, or 1 if that is zero.
     pub fn of_cameras(cameras: &[Camera]) -> Self {
         let positions: Vec<DVec3> = cameras.iter().map(Camera::position).collect();
         let forward = |camera: &Camera| camera.viewmat.row(2).truncate().normalize_or_zero();

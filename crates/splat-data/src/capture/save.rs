@@ -212,6 +212,7 @@ mod tests {
             assert_eq!(view.intrinsics, before.intrinsics);
             assert_eq!(view.lens, before.lens);
             assert_eq!(view.image, before.image);
+            assert_eq!(view.mask, before.mask);
             let entries = view.viewmat.as_flattened().iter();
             for (entry, before) in entries.zip(before.viewmat.as_flattened()) {
                 assert!((entry - before).abs() < 1e-12, "{entry} for {before}");

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use splat_core::Lens;
 
 use super::Point;
+use super::random_points::Room;
 
 /// A sparse model, read and checked: all numbers are finite, every image's camera exists, and there
 /// is at least one image.
@@ -17,6 +18,25 @@ pub(super) struct SparseModel {
     pub images: Vec<SparseImage>,
     /// Points, in file order; empty if the capture has none.
     pub points: Vec<Point>,
+    /// The folder of the photos, if the format names their paths.
+    pub photos: Option<PathBuf>,
+    /// The format's own split.
+    pub split: Option<NamedSplit>,
+    /// Colour on which transparent photos are composited; `None` if alpha is a mask.
+    pub background: Option<[f32; 3]>,
+    /// The cube of random points, if there are no others; by default it follows from the cameras.
+    pub room: Option<Room>,
+}
+
+/// A split by names of images.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct NamedSplit {
+    /// Where it is from, for messages.
+    pub source: String,
+    /// Training images; `None` for all that are not held out.
+    pub train: Option<Vec<String>>,
+    /// Held-out images.
+    pub test: Vec<String>,
 }
 
 /// A camera of the model.
@@ -32,13 +52,47 @@ pub(super) struct SparseCamera {
 pub(super) enum Intrinsics {
     /// `[fx, fy, cx, cy]` in pixels of images of this width and height, pixel centres at + 0.5.
     Pixels { size: [u32; 2], values: [f64; 4] },
+    /// Of photos of any size.
+    OfPhoto {
+        /// Focal lengths along x and y, of which at least one is known; the other is by default the
+        /// same number of pixels.
+        focal: [Option<Focal>; 2],
+        /// Principal point in pixels; by default the middle of the photo.
+        center: [Option<f64>; 2],
+    },
+}
+
+/// A focal length along one side of a photo.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Focal {
+    Pixels(f64),
+    /// The field of view in radians.
+    Angle(f64),
+}
+
+impl Focal {
+    fn pixels(self, side: f64) -> f64 {
+        match self {
+            Self::Pixels(value) => value,
+            Self::Angle(angle) => 0.5 * side / (0.5 * angle).tan(),
+        }
+    }
 }
 
 impl Intrinsics {
-    /// Width and height of the images that the camera took.
+    /// Width and height of the images that the camera took, if they are known.
     pub fn size(&self) -> Option<[u32; 2]> {
         match self {
             Self::Pixels { size, .. } => Some(*size),
+            Self::OfPhoto { .. } => None,
+        }
+    }
+
+    /// These for photos of one size.
+    pub fn of_size(self, size: [u32; 2]) -> Self {
+        match self.fit(size) {
+            Some(values) => Self::Pixels { size, values },
+            None => self,
         }
     }
 
@@ -58,6 +112,13 @@ impl Intrinsics {
                 let most = ((w + 1.0) / cam_w).min((h + 1.0) / cam_h);
                 let (sx, sy) = (w / cam_w, h / cam_h);
                 (least <= most).then_some([fx * sx, fy * sy, cx * sx, cy * sy])
+            }
+            Self::OfPhoto { focal, center } => {
+                let [x, y] = focal;
+                let (x, y) = (x.map(|x| x.pixels(w)), y.map(|y| y.pixels(h)));
+                let [cx, cy] = center;
+                let (cx, cy) = (cx.unwrap_or(0.5 * w), cy.unwrap_or(0.5 * h));
+                Some([x.or(y)?, y.or(x)?, cx, cy])
             }
         }
     }

@@ -190,10 +190,12 @@ fn a_named_split_is_followed() {
         capture.warnings,
         [
             CaptureWarning::SplitNamesUnknown {
+                source: "split.json".into(),
                 count: 1,
                 first: "gone.png".into()
             },
             CaptureWarning::SplitLeavesOut {
+                source: "split.json".into(),
                 count: 6,
                 first: "view r.png".into()
             },
@@ -254,8 +256,14 @@ fn downscale_averages_areas_and_divides_intrinsics() {
 
     // Pixels that do not fill a block are dropped: 7 x 5 by 3 is 2 x 1.
     let image: Vec<u8> = (0..7 * 5).flat_map(|i| [i, 0, 255]).collect();
-    let (pixels, w, h) = downscale::area_average(&image, 7, 5, 3);
-    assert_eq!((w, h), (2, 1));
+    let picture = downscale::Picture {
+        pixels: &image,
+        mask: None,
+        width: 7,
+        height: 5,
+    };
+    let (pixels, mask) = downscale::area_average(&picture, 3);
+    assert_eq!(mask, None);
     assert_eq!(pixels, [8, 0, 255, 11, 0, 255]);
 
     let none = CaptureSettings {
@@ -301,14 +309,17 @@ fn rescaled_photos_take_their_intrinsics_along() {
 }
 
 #[test]
-fn transparent_pixels_are_put_on_black() {
+fn transparent_pixels_are_masked_and_keep_their_colour() {
     let (root, _) = good();
     let pixel = |x: u32, _| image::Rgba([200, 100, 50, if x == 0 { 128 } else { 255 }]);
     image::RgbaImage::from_fn(32, 24, pixel)
         .save(root.path().join("images/view r.png"))
         .unwrap();
     let capture = load(root.path()).unwrap();
-    assert_eq!(capture.views[0].image[..6], [100, 50, 25, 200, 100, 50]);
+    let view = &capture.views[0];
+    assert_eq!(view.image[..6], [200, 100, 50, 200, 100, 50]);
+    assert_eq!(view.mask.as_ref().unwrap()[..3], [128, 255, 255]);
+    assert_eq!(capture.views[1].mask, None);
     let [CaptureWarning::TransparentPhotos { count: 1, .. }] = capture.warnings[..] else {
         panic!("a warning, not {:?}", capture.warnings);
     };
@@ -720,11 +731,10 @@ fn missing_files_are_named() {
         error_of(root.path(), &folder),
         CaptureError::NoModel { .. }
     ));
-    std::fs::write(root.path().join("transforms.json"), b"{}").unwrap();
-
-    let file = root.path().join("transforms.json");
+    let file = root.path().join("transforms.txt");
+    std::fs::write(&file, b"{}").unwrap();
     assert!(matches!(
-        error_of(&file, "transforms.json"),
+        error_of(&file, "transforms.txt"),
         CaptureError::NotAFolder { .. }
     ));
     let absent = root.path().join("absent");

@@ -19,10 +19,28 @@ pub enum CaptureWarning {
         /// Its camera's width and height.
         camera: [u32; 2],
     },
-    /// Photos with transparent pixels; they were composited on black.
+    /// Photos with transparent pixels; these are masked.
     TransparentPhotos {
         /// Number of such photos.
         count: usize,
+        /// The first of them.
+        first: String,
+    },
+    /// Masks that ignore a whole photo.
+    EmptyMasks {
+        /// Number of such photos.
+        count: usize,
+        /// The first of them.
+        first: String,
+    },
+    /// Photos without a mask, beside a folder of masks.
+    PhotosWithoutMask {
+        /// The folder of masks.
+        folder: PathBuf,
+        /// Number of such photos.
+        count: usize,
+        /// Number of all photos.
+        photos: usize,
         /// The first of them.
         first: String,
     },
@@ -60,6 +78,34 @@ pub enum CaptureWarning {
         /// Number of other models beside it.
         others: usize,
     },
+    /// The folder holds another capture, which is not read.
+    OtherCapture {
+        /// The one that is read.
+        used: String,
+        /// The other one.
+        other: PathBuf,
+    },
+    /// Frames without a photo on the disk; they are skipped.
+    MissingPhotos {
+        /// Number of such frames.
+        count: usize,
+        /// Number of frames.
+        frames: usize,
+        /// The first photo that does not exist.
+        first: PathBuf,
+    },
+    /// Held-out photos that are for training too; they are not held out.
+    RepeatedPhotos {
+        /// Number of such photos.
+        count: usize,
+        /// The first of them.
+        first: String,
+    },
+    /// `fisheye_crop_radius` has no effect.
+    CropRadiusIgnored {
+        /// The file that has it.
+        path: PathBuf,
+    },
     /// The capture has no points; random ones take their place.
     RandomPoints {
         /// Number of points.
@@ -78,15 +124,19 @@ pub enum CaptureWarning {
         /// Share of its pixels that no direction falls on.
         share: f64,
     },
-    /// `split.json` names photos that the capture does not have.
+    /// The split names photos that the capture does not have.
     SplitNamesUnknown {
+        /// Where the split is from, such as `split.json`.
+        source: String,
         /// Number of such names.
         count: usize,
         /// The first of them.
         first: String,
     },
-    /// `split.json` leaves photos out of both lists; they are not used.
+    /// The split leaves photos out of both lists; they are not used.
     SplitLeavesOut {
+        /// Where the split is from, such as `split.json`.
+        source: String,
         /// Number of such photos.
         count: usize,
         /// The first of them.
@@ -109,8 +159,52 @@ impl fmt::Display for CaptureWarning {
             ),
             Self::TransparentPhotos { count, first } => write!(
                 f,
-                "{count} photo(s) have transparent pixels, from `{first}`; they were put on black"
+                "{count} photo(s) have transparent pixels, from `{first}`; these are masked, and count neither in training nor in scores"
             ),
+            Self::EmptyMasks { count, first } => write!(
+                f,
+                "{count} photo(s) are masked as a whole, from `{first}`: they teach nothing; in a mask, white counts and black is ignored"
+            ),
+            Self::PhotosWithoutMask {
+                folder,
+                count,
+                photos,
+                first,
+            } => write!(
+                f,
+                "{count} of {photos} photo(s) have no mask in {}, from `{first}` (`{first}.png`), and count as a whole",
+                folder.display()
+            ),
+            Self::DamagedPhotos { count, first } => write!(
+                f,
+                "{count} photo(s) hold more or less data than their picture takes and are likely damaged, from `{first}`; look at them"
+            ),
+            Self::UnregisteredPhotos { count, first } => write!(
+                f,
+                "{count} photo(s) are not in the model and are not used, from `{first}`"
+            ),
+            Self::MissingPhotos {
+                count,
+                frames,
+                first,
+            } => write!(
+                f,
+                "{count} of {frames} frames have no photo and are skipped, from {}",
+                first.display()
+            ),
+            Self::RepeatedPhotos { count, first } => write!(
+                f,
+                "{count} held-out photo(s) are for training too, from `{first}`; they are not held out"
+            ),
+            _ => self.of_the_model(f),
+        }
+    }
+}
+
+impl CaptureWarning {
+    /// Those about cameras, points and the split.
+    fn of_the_model(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
             Self::Miscounted {
                 path,
                 what,
@@ -121,14 +215,6 @@ impl fmt::Display for CaptureWarning {
                 "{}: its comments announce {announced} {what}, but it lists {read}; the file may be cut off, or was edited",
                 path.display()
             ),
-            Self::DamagedPhotos { count, first } => write!(
-                f,
-                "{count} photo(s) hold more or less data than their picture takes and are likely damaged, from `{first}`; look at them"
-            ),
-            Self::UnregisteredPhotos { count, first } => write!(
-                f,
-                "{count} photo(s) are not in the model and are not used, from `{first}`"
-            ),
             Self::OtherModels {
                 used,
                 images,
@@ -138,6 +224,16 @@ impl fmt::Display for CaptureWarning {
                 "only the model in {} is read, which has the most images ({images}) of {}",
                 used.display(),
                 others + 1
+            ),
+            Self::OtherCapture { used, other } => write!(
+                f,
+                "{used} is read, and {} beside it is not; name that file instead of the folder to read it",
+                other.display()
+            ),
+            Self::CropRadiusIgnored { path } => write!(
+                f,
+                "{}: fisheye_crop_radius has no effect; mask the photos where nothing is seen",
+                path.display()
             ),
             Self::RandomPoints {
                 count,
@@ -156,14 +252,31 @@ impl fmt::Display for CaptureWarning {
                 "{count} camera(s) have a lens that folds back inside of the photo, from camera {camera}: no direction falls on {:.0} % of its pixels, at the border, which therefore stay empty; calibrate it again, mask the border, or undistort the photos",
                 (100.0 * share).max(1.0)
             ),
-            Self::SplitNamesUnknown { count, first } => write!(
+            Self::SplitNamesUnknown {
+                source,
+                count,
+                first,
+            } => write!(
                 f,
-                "split.json names {count} photo(s) that the capture does not have, from `{first}`"
+                "{source} names {count} photo(s) that the capture does not have, from `{first}`"
             ),
-            Self::SplitLeavesOut { count, first } => write!(
+            Self::SplitLeavesOut {
+                source,
+                count,
+                first,
+            } => write!(
                 f,
-                "split.json puts {count} photo(s) in neither list; they are not used, from `{first}`"
+                "{source} puts {count} photo(s) in neither list; they are not used, from `{first}`"
             ),
+            // Those that `fmt` shows itself.
+            Self::RescaledPhotos { .. }
+            | Self::TransparentPhotos { .. }
+            | Self::EmptyMasks { .. }
+            | Self::PhotosWithoutMask { .. }
+            | Self::DamagedPhotos { .. }
+            | Self::UnregisteredPhotos { .. }
+            | Self::MissingPhotos { .. }
+            | Self::RepeatedPhotos { .. } => Ok(()),
         }
     }
 }
