@@ -13,7 +13,9 @@ mod scene_scale;
 pub mod text;
 
 pub use camera::Camera;
-pub use capture::{Capture, CaptureError, CaptureSettings, CaptureWarning, Point, Split, View};
+pub use capture::{
+    Capture, CaptureError, CaptureSettings, CaptureWarning, Point, Split, SplitRule, View,
+};
 pub use replace::{
     WriteError, probe_file, probe_files, probe_folder, write_atomically, write_durably,
 };

@@ -274,7 +274,7 @@ pub enum CaptureError {
     },
     /// No view is left for training.
     #[error(
-        "{}: nothing to train on: of {photos} photo(s) all are held out; at least 2 are needed, since every 8th from the first is held out (or name a split in split.json)",
+        "{}: nothing to train on: of {photos} photo(s) all are held out; at least 2 are needed, since every 8th from the first is held out (or name another split, in split.json for example)",
         root.display()
     )]
     NothingToTrainOn {

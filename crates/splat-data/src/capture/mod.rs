@@ -46,7 +46,7 @@ use crate::Camera;
 use random_points::Room;
 
 pub use error::CaptureError;
-pub use split::Split;
+pub use split::{Split, SplitRule};
 pub use warning::CaptureWarning;
 
 /// A photo capture in memory: all photos with their cameras, the sparse points, and the held-out
@@ -119,6 +119,8 @@ pub struct CaptureSettings {
     /// Folder of the photos, relative to the capture or absolute. Default: `images`, or the
     /// capture's folder if that does not exist.
     pub images: Option<PathBuf>,
+    /// Which views are held out of training. Default: those that the capture says.
+    pub split: SplitRule,
 }
 
 impl CaptureSettings {
@@ -133,6 +135,7 @@ impl Default for CaptureSettings {
         Self {
             downscale: 1,
             images: None,
+            split: SplitRule::default(),
         }
     }
 }
@@ -216,7 +219,13 @@ impl Capture {
             warnings.push(room.warning());
         }
         let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
-        let split = Split::of_capture(root, &names, model.split.as_ref(), &mut warnings)?;
+        let split = Split::by_rule(
+            &options.split,
+            root,
+            &names,
+            model.split.as_ref(),
+            &mut warnings,
+        )?;
         Ok(Self {
             name: folder_name(root),
             root: root.to_path_buf(),
@@ -357,6 +366,8 @@ fn folder_name(root: &Path) -> String {
 mod mask_tests;
 #[cfg(test)]
 mod photo_tests;
+#[cfg(test)]
+mod split_tests;
 #[cfg(test)]
 mod test_capture;
 #[cfg(test)]

@@ -166,69 +166,6 @@ fn photos_are_kept_as_they_are() {
 }
 
 #[test]
-fn every_eighth_view_is_held_out() {
-    let (root, _) = good();
-    let split = load(root.path()).unwrap().split;
-    assert_eq!(split.test, [0, 8]);
-    assert_eq!(split.train, [1, 2, 3, 4, 5, 6, 7]);
-}
-
-#[test]
-fn a_named_split_is_followed() {
-    let (root, _) = good();
-    let path = root.path().join("split.json");
-    let json = r#"{"rule": "mine", "train": ["view z.png", "view s.png"], "test": ["view y.png", "gone.png"]}"#;
-    std::fs::write(&path, json).unwrap();
-    let capture = load(root.path()).unwrap();
-    let names = |indices: &[usize]| -> Vec<String> {
-        let name = |&i: &usize| capture.views[i].name.clone();
-        indices.iter().map(name).collect()
-    };
-    assert_eq!(names(&capture.split.train), ["view s.png", "view z.png"]);
-    assert_eq!(names(&capture.split.test), ["view y.png"]);
-    assert_eq!(
-        capture.warnings,
-        [
-            CaptureWarning::SplitNamesUnknown {
-                source: "split.json".into(),
-                count: 1,
-                first: "gone.png".into()
-            },
-            CaptureWarning::SplitLeavesOut {
-                source: "split.json".into(),
-                count: 6,
-                first: "view r.png".into()
-            },
-        ]
-    );
-
-    std::fs::write(
-        &path,
-        r#"{"train": ["view z.png"], "test": ["view z.png"]}"#,
-    )
-    .unwrap();
-    assert!(
-        error_of(root.path(), "split.json")
-            .to_string()
-            .contains("view z.png")
-    );
-    std::fs::write(&path, "[]").unwrap();
-    error_of(root.path(), "split.json");
-
-    // As saved by editors on Windows.
-    let marked = format!("\u{feff}{}", json.replace(", ", ",\r\n"));
-    std::fs::write(&path, marked).unwrap();
-    assert_eq!(load(root.path()).unwrap().split, capture.split);
-    let utf16: Vec<u8> = json.encode_utf16().flat_map(u16::to_le_bytes).collect();
-    std::fs::write(&path, utf16).unwrap();
-    assert!(
-        error_of(root.path(), "split.json")
-            .to_string()
-            .contains("UTF-16")
-    );
-}
-
-#[test]
 fn downscale_averages_areas_and_divides_intrinsics() {
     let (root, _) = good();
     let full = load(root.path()).unwrap();
