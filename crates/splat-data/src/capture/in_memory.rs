@@ -1,6 +1,7 @@
-//! A capture of grey photos from the contents of a model's files, for callers without a folder:
+//! A capture of grey photos from the contents of a capture's files, for callers without a folder:
 //! fuzz targets and their regression tests.
 
+use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -44,7 +45,18 @@ pub fn parse_points(name: &str, contents: &[u8]) -> Result<Vec<Point>, CaptureEr
 }
 
 fn capture((mut model, warnings): (SparseModel, Vec<CaptureWarning>)) -> Capture {
-    let views: Vec<View> = model.images.iter().map(|i| view(&model, i)).collect();
+    let mut photos = HashMap::new();
+    let mut views = Vec::with_capacity(model.images.len());
+    for image in &model.images {
+        let mut view = view(&model, image);
+        // One photo for all views of a size.
+        let grey = || Arc::new(vec![128; 3 * view.pixel_count()]);
+        view.image = photos
+            .entry([view.width, view.height])
+            .or_insert_with(grey)
+            .clone();
+        views.push(view);
+    }
     if model.points.is_empty() {
         let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
         let room = model.room.unwrap_or_else(|| Room::of_cameras(&cameras));
@@ -79,7 +91,7 @@ fn view(model: &SparseModel, image: &SparseImage) -> View {
         intrinsics,
         viewmat: image.viewmat,
         lens: camera.lens,
-        image: Arc::new(vec![128; 3 * width as usize * height as usize]),
+        image: Arc::default(),
         mask: None,
         depth: None,
     }

@@ -97,30 +97,37 @@ impl Intrinsics {
     }
 
     /// `[fx, fy, cx, cy]` for a photo of `size`, or `None` if its aspect ratio differs from the
-    /// camera's.
+    /// camera's, or a number overflows.
     ///
     /// A rescale counts as uniform if one factor explains both sides to within a pixel (sizes are
     /// rounded). Each side is then scaled by its own ratio, so that the photo's edges stay the
     /// camera's edges.
     pub fn fit(&self, size: [u32; 2]) -> Option<[f64; 4]> {
         let [w, h] = size.map(f64::from);
-        match *self {
+        let values = match *self {
             Self::Pixels { size, values } => {
                 let [fx, fy, cx, cy] = values;
                 let [cam_w, cam_h] = size.map(f64::from);
                 let least = ((w - 1.0) / cam_w).max((h - 1.0) / cam_h);
                 let most = ((w + 1.0) / cam_w).min((h + 1.0) / cam_h);
                 let (sx, sy) = (w / cam_w, h / cam_h);
-                (least <= most).then_some([fx * sx, fy * sy, cx * sx, cy * sy])
+                if !(least <= most) {
+                    return None;
+                }
+                [fx * sx, fy * sy, cx * sx, cy * sy]
             }
             Self::OfPhoto { focal, center } => {
                 let [x, y] = focal;
                 let (x, y) = (x.map(|x| x.pixels(w)), y.map(|y| y.pixels(h)));
                 let [cx, cy] = center;
                 let (cx, cy) = (cx.unwrap_or(0.5 * w), cy.unwrap_or(0.5 * h));
-                Some([x.or(y)?, y.or(x)?, cx, cy])
+                [x.or(y)?, y.or(x)?, cx, cy]
             }
-        }
+        };
+        values
+            .iter()
+            .all(|value| value.is_finite())
+            .then_some(values)
     }
 }
 

@@ -23,7 +23,6 @@ use super::format::{CaptureFormat, ReadModel};
 use super::random_points::Room;
 use super::sparse_model::{NamedSplit, SparseCamera, SparseImage, SparseModel};
 use super::{CaptureError, CaptureSettings, CaptureWarning, images, points_file};
-use crate::text::Excerpt;
 use document::{Document, Frame};
 use files::Chosen;
 
@@ -119,14 +118,15 @@ fn assemble(
         &chosen.folder,
         frames.iter().map(|(_, path, frame)| (&**path, frame)),
     )?;
-    if let Some(name) = placed.names.iter().find(|name| !stays_inside(name)) {
-        return Err(CaptureError::BadTransforms {
-            path: chosen.folder.clone(),
-            reason: format!(
-                "the photo `{}` has no safe name; move the photos to one folder",
-                Excerpt(name)
-            ),
-        });
+    for ((_, path, frame), name) in frames.iter().zip(&placed.names) {
+        if !stays_inside(name) {
+            return Err(CaptureError::BadRecord {
+                path: path.clone(),
+                record: frame.record(),
+                reason: "its file_path gives no name inside of one folder; move all photos to one"
+                    .to_owned(),
+            });
+        }
     }
     let mut frames = unique(frames.into_iter().zip(placed.names), warnings)?;
     let split = if has_test {

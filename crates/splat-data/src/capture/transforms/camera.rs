@@ -7,6 +7,9 @@ use super::super::colmap_models;
 use super::super::sparse_model::{Focal, Intrinsics};
 use super::fields::{Fields, shown};
 
+/// Fields of view up to this, in radians, are none.
+const NARROWEST: f64 = 1e-6;
+
 /// Kinds of cameras in `camera_model`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum Model {
@@ -62,7 +65,7 @@ pub(super) fn intrinsics(top: &Fields<'_>, frame: &Fields<'_>) -> Result<Intrins
         let Some(value) = number(angle)? else {
             return Ok(None);
         };
-        if !(value > 0.0 && value < std::f64::consts::PI) {
+        if !(value > NARROWEST && value < std::f64::consts::PI) {
             return Err(frame.error(&format!(
                 "its {angle} is {value}; it must be an angle between 0 and pi radians"
             )));

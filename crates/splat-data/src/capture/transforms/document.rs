@@ -81,9 +81,12 @@ impl Document {
         };
         let text = utf8(bytes).map_err(bad)?;
         let value: Value = serde_json::from_str(text).map_err(|error| {
-            bad(format!(
-                "no JSON ({error}); numbers must be finite, and NaN is none"
-            ))
+            // Python writes these, and JSON has none of them.
+            let odd = ["NaN", "Infinity"]
+                .into_iter()
+                .find(|word| text.contains(word));
+            let hint = odd.map_or_else(String::new, |word| format!("; JSON has no {word}"));
+            bad(format!("no JSON ({error}){hint}"))
         })?;
         let Value::Object(map) = &value else {
             return Err(bad(format!(

@@ -253,7 +253,7 @@ fn an_angle_is_enough() {
 #[test]
 fn nonsense_is_named() {
     type Change = fn(&mut Value);
-    let cases: [(&str, Change); 24] = [
+    let cases: [(&str, Change); 25] = [
         ("`frames` is missing", |json| *json = json!({})),
         ("`frames` is missing or empty", |json| {
             json["frames"] = json!([])
@@ -309,6 +309,9 @@ fn nonsense_is_named() {
         }),
         ("its camera_angle_x is 4", |json| {
             (json["fl_x"], json["camera_angle_x"]) = (Value::Null, 4.0.into());
+        }),
+        ("its camera_angle_x is 0.0000000001", |json| {
+            (json["fl_x"], json["camera_angle_x"]) = (Value::Null, 1e-10.into());
         }),
         ("distortion_params[1] is null", |json| {
             json["distortion_params"] = json!([1, null])
