@@ -1,9 +1,11 @@
 //! Captures: photos with their cameras and the points from structure from motion.
 //!
-//! [`Capture::load`] reads a folder in COLMAP's layout, decodes every photo once in parallel, and
-//! returns plain data, without tensors or printed output. Problems that can be tolerated are
-//! returned as [`Capture::warnings`]; others are a [`CaptureError`] that names the file, the record
-//! and the remedy.
+//! [`Capture::load`] reads a folder in COLMAP's layout, or with `transforms.json` (nerfstudio,
+//! instant-ngp, Blender), decodes every photo once in parallel, and returns plain data, without
+//! tensors or printed output. Problems that can be tolerated are returned as [`Capture::warnings`];
+//! others are a [`CaptureError`] that names the file, the record and the remedy.
+//!
+//! Which files are read, and what their fields mean, is in `docs/CAPTURES.md`.
 //!
 //! Conventions (project-wide): right-handed world; camera axes +x right, +y down, +z forward; the
 //! view matrix maps world to camera; the centre of pixel (i, j) is at (i + 0.5, j + 0.5).
@@ -79,7 +81,8 @@ type Progress<'a> = &'a (dyn Fn(usize, usize) + Sync);
 /// One photo and the camera that took it.
 #[derive(Debug, Clone)]
 pub struct View {
-    /// Name of the photo in the capture, relative to the folder of the photos.
+    /// Name of the photo in the capture, relative to the folder of the photos, from which it never
+    /// leads out.
     pub name: String,
     /// Width of `image` in pixels.
     pub width: u32,
@@ -141,17 +144,25 @@ impl Default for CaptureSettings {
 }
 
 impl Capture {
-    /// Reads the capture in the folder `root`.
+    /// Reads the capture in the folder `root`, or the `transforms.json` that `root` is.
     ///
-    /// The COLMAP model is searched in `sparse/0`, `sparse` and `root`, binary before text; the
-    /// photos in [`CaptureSettings::images`]. Cameras must be `PINHOLE` or `SIMPLE_PINHOLE`. If a
-    /// photo's size is a uniform rescale of its camera's, the intrinsics are scaled to the photo,
-    /// with a warning. Photos with a missing part are refused. The held-out views are those named
-    /// by `split.json`, or else every 8th by name from the first.
+    /// Read is the first of these that the folder has; a warning names others:
     ///
-    /// Reading a model takes less than 32 times the memory of its files, and a JPEG file 64 times,
-    /// while it is read. The pixels of the photos take three bytes each in addition, and up to
-    /// twelve while a photo is decoded.
+    /// 1. a COLMAP model in a numbered folder of `sparse`, of which the one with the most images
+    ///    counts, or in `sparse` or `root`, binary before text;
+    /// 2. `transforms_train.json`, with `transforms_test.json`, or else `transforms_val.json`, held
+    ///    out;
+    /// 3. `transforms.json`.
+    ///
+    /// If a photo's size is a uniform rescale of its camera's, the intrinsics are scaled to the
+    /// photo, with a warning. Photos are JPEG, PNG, WebP or TIFF, and are kept as 8-bit RGB. A
+    /// photo with a missing part is refused. Alpha and masks become [`View::mask`]; Blender's
+    /// pictures are composited on white instead ([`Capture::background`]). A capture without points
+    /// gets random ones, with a warning.
+    ///
+    /// Reading a COLMAP model takes less than 32 times the memory of its files, a `transforms.json`
+    /// 128 times, and a JPEG file 64 times, while it is read. The pixels of the photos take three
+    /// bytes each in addition, or four with masks, and up to twelve while a photo is decoded.
     ///
     /// ```
     /// use splat_data::{Capture, CaptureSettings};
