@@ -29,6 +29,16 @@ fn colmap_text() {
 }
 
 #[test]
+fn transforms() {
+    runs("transforms", 150_000);
+}
+
+#[test]
+fn points() {
+    runs("points", 300_000);
+}
+
+#[test]
 fn ply() {
     runs("ply", 300_000);
 }

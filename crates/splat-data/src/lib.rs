@@ -1,8 +1,27 @@
 //! Captures and scene files as plain data, without tensors.
 //!
-//! [`Capture`] is a set of photos with their cameras and the points from structure from motion;
-//! [`scene`] reads and writes trained splats ([`SplatData`]); [`SceneScale`] is the size of a
-//! scene, from which every length follows.
+//! [`Capture`] is a set of photos with their cameras, masks, and the points from structure from
+//! motion, from COLMAP, nerfstudio, instant-ngp or Blender; [`scene`] reads and writes trained
+//! splats ([`SplatData`]); [`SceneScale`] is the size of a scene, from which every length follows.
+//!
+//! ```
+//! use splat_data::{Capture, CaptureSettings, SplitRule};
+//!
+//! # let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
+//! let options = CaptureSettings::new()
+//!     .with_downscale(16)
+//!     .with_split(SplitRule::Every(10));
+//! let capture = Capture::load(folder, &options)?;
+//! for warning in &capture.warnings {
+//!     eprintln!("warning: {warning}");
+//! }
+//! let view = &capture.views[0];
+//! assert_eq!(view.image.len(), 3 * (view.width * view.height) as usize);
+//! assert_eq!(capture.split.test.len(), 4);
+//! let (pixel, depth) = view.project(capture.points[0].position).expect("in front");
+//! println!("{}: {pixel:?} at {depth}", view.name);
+//! # Ok::<(), splat_data::CaptureError>(())
+//! ```
 
 mod camera;
 pub mod capture;
@@ -13,7 +32,9 @@ mod scene_scale;
 pub mod text;
 
 pub use camera::Camera;
-pub use capture::{Capture, CaptureError, CaptureSettings, CaptureWarning, Point, Split, View};
+pub use capture::{
+    Capture, CaptureError, CaptureSettings, CaptureWarning, Point, Split, SplitRule, View,
+};
 pub use replace::{
     WriteError, probe_file, probe_files, probe_folder, write_atomically, write_durably,
 };

@@ -19,7 +19,7 @@ pub(super) struct Model {
 }
 
 impl Model {
-    /// Two cameras, one of each supported model; five images; six points.
+    /// Three cameras, two of them pinholes and one with distortion; five images; six points.
     pub(super) fn small() -> Self {
         let keypoints = |i: u32| {
             let keypoint = |k: u32| (f64::from(k) + 1.5, 2.5, i64::from(k) - 1);
@@ -29,13 +29,20 @@ impl Model {
             cameras: vec![
                 (7, 1, 24, 18, vec![30.0, 31.0, 12.0, 9.0]),
                 (2, 0, 16, 20, vec![25.0, 8.0, 10.0]),
+                (
+                    3,
+                    4,
+                    20,
+                    16,
+                    vec![30.0, 31.0, 10.0, 8.0, -0.1, 0.01, 1e-3, 0.0],
+                ),
             ],
             images: (0..5)
                 .map(|i| {
                     let turn = f64::from(i) * 0.2;
                     let name = format!("{}view {i}.png", ["", "left/"][i as usize % 2]);
                     let quaternion = [turn.cos(), 0.0, turn.sin(), 0.0];
-                    let camera = if i % 2 == 0 { 7 } else { 2 };
+                    let camera = [7, 2, 3][i as usize % 3];
                     (
                         i + 1,
                         quaternion,
@@ -101,10 +108,17 @@ impl Model {
     /// cameras.txt, images.txt, points3D.txt.
     pub(super) fn text(&self) -> Input {
         let mut cameras = String::from(
-            "# Camera list with one line of data per camera:\n# Number of cameras: 2\n",
+            "# Camera list with one line of data per camera:\n# Number of cameras: 3\n",
         );
         for (id, model, width, height, parameters) in &self.cameras {
-            let model = ["SIMPLE_PINHOLE", "PINHOLE"][*model as usize];
+            let models = [
+                "SIMPLE_PINHOLE",
+                "PINHOLE",
+                "SIMPLE_RADIAL",
+                "RADIAL",
+                "OPENCV",
+            ];
+            let model = models[*model as usize];
             writeln!(
                 cameras,
                 "{id} {model} {width} {height} {}",

@@ -140,7 +140,14 @@ fn records(part: usize, bytes: &[u8]) -> Vec<Range<usize>> {
         match part {
             0 => {
                 let model = bytes.get(start + 4)?;
-                Some(start + 24 + if *model == 1 { 32 } else { 24 })
+                let parameters = match *model {
+                    1 | 2 | 8 | 15 => 4,
+                    3 | 9 => 5,
+                    4 | 5 => 8,
+                    6 => 12,
+                    _ => 3,
+                };
+                Some(start + 24 + 8 * parameters)
             }
             1 => {
                 let name = bytes

@@ -17,10 +17,13 @@ pub(super) const TARGET: Target = Target {
     memory: per_byte(16),
 };
 
-const WORDS: [&str; 10] = [
+const WORDS: [&str; 13] = [
     "PINHOLE",
     "SIMPLE_PINHOLE",
     "OPENCV",
+    "FULL_OPENCV",
+    "SIMPLE_RADIAL",
+    "SIMPLE_FISHEYE",
     "# Number of images: 5,",
     "# Number of images: 99999999999999999999",
     "1.5 2.5 -1",

@@ -8,7 +8,9 @@ mod config;
 mod fixture;
 mod gaussians;
 mod ply;
+mod points;
 mod safetensors;
+mod transforms;
 
 use std::sync::{Arc, LazyLock};
 
@@ -59,15 +61,18 @@ pub struct Memory {
 /// | reader | bytes for each of the file | and |
 /// |---|---|---|
 /// | COLMAP, binary or text | 16 | 8 KiB |
-/// | PLY | 32 | 520 KiB, of which 512 are what the PLY library makes room for before it reads a list |
+/// | transforms.json | 128 | 8 KiB |
+/// | PLY, of splats or points | 32 | 520 KiB, of which 512 are what the PLY library makes room for before it reads a list |
 /// | gradient fixture | 16 | 8 KiB |
 /// | checkpoint | 32 | 8 KiB |
 /// | Gaussians as burnpack | 32 | 2,056 KiB, of which 2,048 are what the library makes room for |
 /// | settings (TOML), which are at most 1 MiB | 1,024 | 8 KiB |
-pub static TARGETS: [Target; 7] = [
+pub static TARGETS: [Target; 9] = [
     colmap_binary::TARGET,
     colmap_text::TARGET,
+    transforms::TARGET,
     ply::TARGET,
+    points::TARGET,
     fixture::TARGET,
     checkpoint::TARGET,
     config::TARGET,

@@ -130,7 +130,7 @@ fn big_endian(file: &[u8]) -> Vec<u8> {
     header.into_bytes().into_iter().chain(turned).collect()
 }
 
-fn mutate(input: &mut Input, rng: &mut Pcg64Mcg) {
+pub(super) fn mutate(input: &mut Input, rng: &mut Pcg64Mcg) {
     let file = &mut input.0[0];
     let at = body(file);
     let mut rest = file.split_off(at);

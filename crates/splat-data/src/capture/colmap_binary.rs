@@ -6,49 +6,39 @@
 use std::fmt::Display;
 use std::path::Path;
 
-use super::colmap_models::{model_name, pinhole_intrinsics, pinhole_parameters};
-use super::sparse_model::{SparseCamera, SparseImage};
+use super::colmap_models::{MOST_PARAMETERS, by_number};
+use super::colmap_records::{ColmapCamera, ColmapImage};
 use super::{CaptureError, Point};
 
 /// Bytes of a camera record up to its parameters, of the shortest image record, and of the shortest
 /// point record.
 const MIN_CAMERA: usize = 4 + 4 + 8 + 8;
-const MIN_IMAGE: usize = 4 + 7 * 8 + 4 + 1 + 8;
+pub(super) const MIN_IMAGE: usize = 4 + 7 * 8 + 4 + 1 + 8;
 const MIN_POINT: usize = 8 + 3 * 8 + 3 + 8 + 8;
 /// Bytes of one keypoint (x, y, point id) and of one track entry (image id, keypoint index).
 const KEYPOINT: usize = 8 + 8 + 8;
 const TRACK_ENTRY: usize = 4 + 4;
 
 /// Reads `cameras.bin`.
-pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<SparseCamera>, CaptureError> {
+pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapCamera>, CaptureError> {
     let mut reader = Reader::new(path, bytes);
     reader.records("camera", "cameras", MIN_CAMERA, |reader, record| {
         let id = reader.u32(record, "id")?;
-        let model = model_name(reader.i32(record, "model")?);
-        let Some(parameters) = pinhole_parameters(&model) else {
-            return Err(CaptureError::UnsupportedCamera {
-                path: path.to_path_buf(),
-                camera_id: id,
-                model,
-            });
-        };
+        let layout = by_number(reader.i32(record, "model")?)
+            .map_err(|model| CaptureError::unsupported_camera(path, id, model))?;
         let width = reader.size(record, "width")?;
         let height = reader.size(record, "height")?;
-        let mut values = [0.0; 4];
-        for value in &mut values[..parameters] {
+        let mut values = [0.0; MOST_PARAMETERS];
+        let values = &mut values[..layout.parameters()];
+        for value in &mut *values {
             *value = reader.f64(record, "parameters")?;
         }
-        Ok(SparseCamera {
-            id,
-            width,
-            height,
-            intrinsics: pinhole_intrinsics(&values[..parameters]),
-        })
+        Ok(ColmapCamera::new(id, [width, height], layout, values))
     })
 }
 
 /// Reads `images.bin`; the keypoints are skipped.
-pub(super) fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<SparseImage>, CaptureError> {
+pub(super) fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>, CaptureError> {
     let mut reader = Reader::new(path, bytes);
     reader.records("image", "images", MIN_IMAGE, |reader, record| {
         let id = reader.u32(record, "id")?;
@@ -57,7 +47,7 @@ pub(super) fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<SparseImage>
         let camera_id = reader.u32(record, "camera id")?;
         let name = reader.name(record)?;
         reader.skip_list(record, "keypoints", KEYPOINT)?;
-        Ok(SparseImage {
+        Ok(ColmapImage {
             id,
             camera_id,
             name,

@@ -7,8 +7,8 @@
 use std::path::Path;
 use std::str::{FromStr, SplitAsciiWhitespace};
 
-use super::colmap_models::{pinhole_intrinsics, pinhole_parameters};
-use super::sparse_model::{SparseCamera, SparseImage};
+use super::colmap_models::{MOST_PARAMETERS, by_name};
+use super::colmap_records::{ColmapCamera, ColmapImage};
 use super::{CaptureError, CaptureWarning, Point};
 use crate::text::{Excerpt, lines, without_mark};
 
@@ -45,34 +45,26 @@ impl<T> Listed<T> {
 pub(super) fn parse_cameras(
     path: &Path,
     text: &[u8],
-) -> Result<Listed<SparseCamera>, CaptureError> {
+) -> Result<Listed<ColmapCamera>, CaptureError> {
     let file = File::new(path, text)?;
     let camera = |mut fields: Fields<'_>| {
         let id = fields.next("camera id")?;
         let model: String = fields.next("model")?;
-        let Some(parameters) = pinhole_parameters(&model) else {
-            return Err(CaptureError::UnsupportedCamera {
-                path: path.to_path_buf(),
-                camera_id: id,
-                model: Excerpt(&model).to_string(),
-            });
-        };
-        let width = fields.next("width")?;
-        let height = fields.next("height")?;
-        let mut values = [0.0; 4];
-        for value in &mut values[..parameters] {
+        let layout =
+            by_name(&model).map_err(|model| CaptureError::unsupported_camera(path, id, model))?;
+        let size = [fields.next("width")?, fields.next("height")?];
+        let count = layout.parameters();
+        let mut values = [0.0; MOST_PARAMETERS];
+        let values = &mut values[..count];
+        for value in &mut *values {
             *value = fields.next("parameters")?;
         }
         if fields.fields.next().is_some() {
-            let reason = format!("it has more than the {parameters} parameters of {model}");
-            return Err(fields.error(&reason));
+            return Err(fields.error(&format!(
+                "it has more than the {count} parameters of {model}"
+            )));
         }
-        Ok(SparseCamera {
-            id,
-            width,
-            height,
-            intrinsics: pinhole_intrinsics(&values[..parameters]),
-        })
+        Ok(ColmapCamera::new(id, size, layout, values))
     };
     Ok(Listed {
         records: file
@@ -91,7 +83,7 @@ pub(super) fn parse_cameras(
 /// classified by its contents: keypoints are numbers only, in triples, which an image with a name
 /// is not. An ambiguous line (a name that is a number, or keypoints that look like ids) counts as
 /// keypoints if it follows an image.
-pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<SparseImage>, CaptureError> {
+pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<ColmapImage>, CaptureError> {
     /// State after the last non-blank line, and an empty one after it.
     #[derive(PartialEq)]
     enum Next {
@@ -136,7 +128,7 @@ pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<SparseImag
 }
 
 /// The image of a line, or the reason that it is none.
-fn image(mut fields: Fields<'_>) -> Result<SparseImage, String> {
+fn image(mut fields: Fields<'_>) -> Result<ColmapImage, String> {
     let id = fields.parsed("image id")?;
     let quaternion = fields.parsed_array("quaternion")?;
     let translation = fields.parsed_array("translation")?;
@@ -146,7 +138,7 @@ fn image(mut fields: Fields<'_>) -> Result<SparseImage, String> {
     if name.is_empty() {
         return Err("its name is missing".to_owned());
     }
-    Ok(SparseImage {
+    Ok(ColmapImage {
         id,
         camera_id,
         name: name.to_owned(),

@@ -1,7 +1,8 @@
-//! Errors and warnings of captures.
+//! Errors of captures.
 
-use std::fmt;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+
+use super::colmap_models;
 
 /// Why a capture cannot be used. Every message is one line that names the file and the record, and
 /// says what to do where that is not obvious.
@@ -17,24 +18,22 @@ pub enum CaptureError {
         source: std::io::Error,
     },
     /// The capture's path is not a folder.
-    #[error("{}: not a folder; a capture is a folder with `images/` and `sparse/0/`", path.display())]
+    #[error("{}: neither a folder nor a .json file; a capture is a folder with `images/` and `sparse/0/`, or with `transforms.json`", path.display())]
     NotAFolder {
         /// The path given.
         path: PathBuf,
     },
-    /// The folder holds no model.
+    /// The folder holds no capture in a known format.
     #[error(
-        "{}: no COLMAP model: looked for cameras.bin and cameras.txt in `sparse/0`, `sparse` and the folder itself{hint}",
+        "{}: no capture: looked for COLMAP's cameras.bin and cameras.txt in `sparse/0`, `sparse` and the folder itself, and for transforms.json and transforms_train.json",
         root.display()
     )]
     NoModel {
         /// The capture's folder.
         root: PathBuf,
-        /// Apparent contents of the folder, if any.
-        hint: &'static str,
     },
-    /// One of the three files of a model is missing.
-    #[error("{}: missing; a COLMAP model needs cameras, images and points3D, all .bin or all .txt", path.display())]
+    /// One of the files of a model is missing.
+    #[error("{}: missing; a COLMAP model needs cameras and images, both .bin or both .txt", path.display())]
     MissingModelFile {
         /// The file.
         path: PathBuf,
@@ -99,32 +98,48 @@ pub enum CaptureError {
         /// The reason.
         reason: String,
     },
-    /// A camera model with distortion or of another unsupported kind.
+    /// A `transforms.json` that is none.
+    #[error("{}: {reason}", path.display())]
+    BadTransforms {
+        /// The file.
+        path: PathBuf,
+        /// The reason.
+        reason: String,
+    },
+    /// Most photos of a `transforms.json` do not exist.
     #[error(
-        "{}: camera {camera_id} has the model {model}; only PINHOLE and SIMPLE_PINHOLE can be read, undistort the photos first (`colmap image_undistorter`)",
+        "{}: {missing} of its {frames} frames have no photo, from {}; restore the photos, or name their folder with --images",
+        path.display(), first.display()
+    )]
+    MissingPhotos {
+        /// The file with the frames.
+        path: PathBuf,
+        /// Number of frames without a photo.
+        missing: usize,
+        /// Number of frames.
+        frames: usize,
+        /// The first photo that does not exist.
+        first: PathBuf,
+    },
+    /// A camera model that is not implemented.
+    #[error(
+        "{}: camera {camera_id} has the camera model {model}, which cannot be read: {remedy}",
         path.display()
     )]
     UnsupportedCamera {
-        /// The cameras file.
+        /// The file with the cameras.
         path: PathBuf,
         /// Id of the camera.
         camera_id: u32,
-        /// COLMAP's name of its model.
+        /// Name and number of its model.
         model: String,
+        /// What to do.
+        remedy: &'static str,
     },
     /// A model without images.
     #[error("{}: the model holds no image; the reconstruction found no camera, run it again with more overlap", path.display())]
     NoImages {
         /// The images file.
-        path: PathBuf,
-    },
-    /// A model without points.
-    #[error(
-        "{}: the model holds no point, and training starts from them; triangulate first (`colmap point_triangulator`)",
-        path.display()
-    )]
-    NoPoints {
-        /// The points file.
         path: PathBuf,
     },
     /// The folder given for the photos does not exist.
@@ -174,7 +189,7 @@ pub enum CaptureError {
         reason: String,
     },
     /// A photo that cannot be decoded.
-    #[error("{}: cannot be decoded as JPEG or PNG: {reason}", path.display())]
+    #[error("{}: cannot be decoded as JPEG, PNG, WebP or TIFF: {reason}", path.display())]
     UndecodablePhoto {
         /// The photo.
         path: PathBuf,
@@ -218,6 +233,21 @@ pub enum CaptureError {
         /// The camera's width and height.
         camera: [u32; 2],
     },
+    /// A mask that differs in size from its photo.
+    #[error(
+        "{}: the mask is {}x{} pixels, but its photo {} is {}x{}; rescale the mask to the photo's size, or use the photos it was made for",
+        mask.display(), mask_size[0], mask_size[1], photo.display(), photo_size[0], photo_size[1]
+    )]
+    MaskSize {
+        /// The mask.
+        mask: PathBuf,
+        /// Its width and height.
+        mask_size: [u32; 2],
+        /// The photo.
+        photo: PathBuf,
+        /// Its width and height.
+        photo_size: [u32; 2],
+    },
     /// A photo too small for SSIM.
     #[error(
         "{}: the photo is {}x{} pixels{}; at least {min}x{min} are needed, the window of SSIM",
@@ -244,7 +274,7 @@ pub enum CaptureError {
     },
     /// No view is left for training.
     #[error(
-        "{}: nothing to train on: of {photos} photo(s) all are held out; at least 2 are needed, since every 8th from the first is held out (or name a split in split.json)",
+        "{}: nothing to train on: of {photos} photo(s) all are held out; at least 2 are needed, since every 8th from the first is held out (or name another split, in split.json for example)",
         root.display()
     )]
     NothingToTrainOn {
@@ -258,125 +288,13 @@ pub enum CaptureError {
     ZeroDownscale,
 }
 
-/// A problem that did not prevent reading the capture. `Display` gives one line.
-#[derive(Debug, Clone, PartialEq)]
-#[non_exhaustive]
-pub enum CaptureWarning {
-    /// Photos were rescaled without rewriting the cameras; the intrinsics were scaled to the
-    /// photos.
-    RescaledPhotos {
-        /// Number of such photos.
-        count: usize,
-        /// The first of them.
-        first: String,
-        /// Its width and height.
-        photo: [u32; 2],
-        /// Its camera's width and height.
-        camera: [u32; 2],
-    },
-    /// Photos with transparent pixels; they were composited on black.
-    TransparentPhotos {
-        /// Number of such photos.
-        count: usize,
-        /// The first of them.
-        first: String,
-    },
-    /// A text file of the model lists more or fewer records than its comments announce.
-    Miscounted {
-        /// The file.
-        path: PathBuf,
-        /// The listed items.
-        what: &'static str,
-        /// The number in the comments.
-        announced: u64,
-        /// The number of records.
-        read: usize,
-    },
-    /// JPEG files with more data than their picture needs, or less detail than announced.
-    DamagedPhotos {
-        /// Number of such photos.
-        count: usize,
-        /// The first of them.
-        first: String,
-    },
-    /// Photos in the folder that the model does not name; they are not used.
-    UnregisteredPhotos {
-        /// Number of such photos.
-        count: usize,
-        /// The first of them, by name.
-        first: String,
-    },
-    /// More than one model was found; only the first is read.
-    OtherModels {
-        /// The folder that was read.
-        used: PathBuf,
-        /// Number of other models beside it.
-        others: usize,
-    },
-    /// `split.json` names photos that the capture does not have.
-    SplitNamesUnknown {
-        /// Number of such names.
-        count: usize,
-        /// The first of them.
-        first: String,
-    },
-    /// `split.json` leaves photos out of both lists; they are not used.
-    SplitLeavesOut {
-        /// Number of such photos.
-        count: usize,
-        /// The first of them.
-        first: String,
-    },
-}
-
-impl fmt::Display for CaptureWarning {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::RescaledPhotos {
-                count,
-                first,
-                photo,
-                camera,
-            } => write!(
-                f,
-                "{count} photo(s) differ in size from their camera, from `{first}` ({}x{} against {}x{}); the intrinsics were scaled to the photos",
-                photo[0], photo[1], camera[0], camera[1]
-            ),
-            Self::TransparentPhotos { count, first } => write!(
-                f,
-                "{count} photo(s) have transparent pixels, from `{first}`; they were put on black"
-            ),
-            Self::Miscounted {
-                path,
-                what,
-                announced,
-                read,
-            } => write!(
-                f,
-                "{}: its comments announce {announced} {what}, but it lists {read}; the file may be cut off, or was edited",
-                path.display()
-            ),
-            Self::DamagedPhotos { count, first } => write!(
-                f,
-                "{count} photo(s) hold more or less data than their picture takes and are likely damaged, from `{first}`; look at them"
-            ),
-            Self::UnregisteredPhotos { count, first } => write!(
-                f,
-                "{count} photo(s) are not in the model and are not used, from `{first}`"
-            ),
-            Self::OtherModels { used, others } => write!(
-                f,
-                "only the model in {} is read; {others} other(s) lie beside it",
-                used.display()
-            ),
-            Self::SplitNamesUnknown { count, first } => write!(
-                f,
-                "split.json names {count} photo(s) that the capture does not have, from `{first}`"
-            ),
-            Self::SplitLeavesOut { count, first } => write!(
-                f,
-                "split.json puts {count} photo(s) in neither list; they are not used, from `{first}`"
-            ),
+impl CaptureError {
+    pub(super) fn unsupported_camera(path: &Path, camera_id: u32, model: String) -> Self {
+        Self::UnsupportedCamera {
+            path: path.to_path_buf(),
+            camera_id,
+            remedy: colmap_models::remedy(&model),
+            model,
         }
     }
 }

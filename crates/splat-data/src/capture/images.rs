@@ -2,17 +2,18 @@
 
 mod folders;
 
-use std::io::Cursor;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
-use image::{DynamicImage, ImageError, ImageFormat, ImageReader};
+use image::ImageReader;
 use rayon::prelude::*;
-use splat_core::Lens;
 use splat_core::memory::available_memory;
 
+use super::masks::{self, Masks};
+use super::photo_file::{PhotoFile, rgb_and_alpha};
 use super::sparse_model::{SparseCamera, SparseImage, SparseModel};
-use super::{CaptureError, CaptureSettings, CaptureWarning, View, downscale, jpeg};
+use super::{CaptureError, CaptureSettings, CaptureWarning, Progress, View, downscale};
 
 /// Smallest width and height of a photo: the window of SSIM.
 pub(super) const MIN_SIDE: u32 = 11;
@@ -23,7 +24,10 @@ pub(super) fn folder(
     model: &SparseModel,
     options: &CaptureSettings,
 ) -> Result<PathBuf, CaptureError> {
-    folders::of_photos(root, options.images.as_deref(), model)
+    match (&model.photos, &options.images) {
+        (Some(folder), None) => Ok(folder.clone()),
+        (_, given) => folders::of_photos(root, given.as_deref(), model),
+    }
 }
 
 /// Loads the photo of every image of the model. The views are in the order of the model's images.
@@ -32,6 +36,7 @@ pub(super) fn load(
     folder: &Path,
     model: &SparseModel,
     options: &CaptureSettings,
+    progress: Progress<'_>,
     warnings: &mut Vec<CaptureWarning>,
 ) -> Result<Vec<View>, CaptureError> {
     // Look for every photo before decoding any, so that the likeliest mistake is found at once.
@@ -45,18 +50,43 @@ pub(super) fn load(
             });
         }
     }
-    let factor = options.downscale;
-    check_memory(root, folder, model, factor, available_memory())?;
+    check_memory(root, folder, model, options.downscale, available_memory())?;
+    let loader = Loader {
+        folder,
+        masks: Masks::beside(root, folder),
+        factor: options.downscale,
+        background: model.background,
+    };
+    let (done, total) = (AtomicUsize::new(0), model.images.len());
     let loaded: Vec<Result<Loaded, CaptureError>> = model
         .images
         .par_iter()
-        .map(|image| load_one(folder, image, &model.cameras[&image.camera_id], factor))
+        .map(|image| {
+            let loaded = loader.load(image, &model.cameras[&image.camera_id]);
+            progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
+            loaded
+        })
         .collect();
     let loaded = loaded.into_iter().collect::<Result<Vec<_>, _>>()?;
     warnings.extend(rescaled(&loaded));
-    warnings.extend(transparent(&loaded));
-    warnings.extend(damaged(&loaded));
-    warnings.extend(folders::unregistered(root, folder, model));
+    let found = |kind: fn(&Loaded) -> bool| {
+        let mut odd = loaded.iter().filter(|loaded| kind(loaded));
+        let first = odd.next()?.view.name.clone();
+        Some((1 + odd.count(), first))
+    };
+    let transparent = found(|loaded| loaded.transparent);
+    let damaged = found(|loaded| loaded.suspect);
+    let empty = found(|loaded| loaded.empty_mask);
+    warnings.extend(
+        transparent.map(|(count, first)| CaptureWarning::TransparentPhotos { count, first }),
+    );
+    warnings.extend(damaged.map(|(count, first)| CaptureWarning::DamagedPhotos { count, first }));
+    warnings.extend(empty.map(|(count, first)| CaptureWarning::EmptyMasks { count, first }));
+    warnings.extend(loader.masks.missing(&model.images));
+    // Blender writes depth and normals beside its pictures.
+    if model.background.is_none() {
+        warnings.extend(folders::unregistered(root, folder, model));
+    }
     Ok(loaded.into_iter().map(|loaded| loaded.view).collect())
 }
 
@@ -74,7 +104,7 @@ pub(super) fn check_memory(
     };
     let of_camera = |image: &SparseImage| {
         let camera = &model.cameras[&image.camera_id];
-        bytes([camera.width, camera.height])
+        camera.intrinsics.size().map_or(u64::MAX, bytes)
     };
     let Some(left) = left else { return Ok(()) };
     // Photos may differ in size from their cameras. Looking at each takes time and is skipped if
@@ -110,155 +140,104 @@ pub(super) fn check_memory(
 /// A view with the warnings about its photo.
 struct Loaded {
     view: View,
+    /// True if alpha masks a part of the photo.
     transparent: bool,
+    /// True if the mask ignores the whole photo.
+    empty_mask: bool,
     /// True if the file is likely damaged, although its picture is complete.
     suspect: bool,
     /// Sizes of photo and camera if they differ.
     rescaled: Option<[[u32; 2]; 2]>,
 }
 
-fn load_one(
-    folder: &Path,
-    image: &SparseImage,
-    camera: &SparseCamera,
+/// What all photos of a capture have in common.
+struct Loader<'a> {
+    folder: &'a Path,
+    masks: Masks,
     factor: u32,
-) -> Result<Loaded, CaptureError> {
-    let path = folder.join(&image.name);
-    let mut file = PhotoFile::open(&path)?;
-    let size = file.size(&path)?;
-    let camera_size = [camera.width, camera.height];
-    let Some(mut intrinsics) = fit_intrinsics(camera, size) else {
-        return Err(CaptureError::PhotoSize {
-            path,
-            photo: size,
-            camera_id: camera.id,
-            camera: camera_size,
-        });
-    };
-    let suspect = file.check_whole(&path)?;
-    let photo = file.decode(&path)?;
-
-    let (mut pixels, transparent) = opaque_rgb(photo);
-    let [mut width, mut height] = size;
-    if factor > 1 {
-        (pixels, width, height) = downscale::area_average(&pixels, width, height, factor);
-        intrinsics = downscale::intrinsics(intrinsics, factor);
-    }
-    if width < MIN_SIDE || height < MIN_SIDE {
-        return Err(CaptureError::PhotoTooSmall {
-            path,
-            size: [width, height],
-            downscale: factor,
-            min: MIN_SIDE,
-        });
-    }
-    Ok(Loaded {
-        view: View {
-            name: image.name.clone(),
-            width,
-            height,
-            intrinsics,
-            viewmat: image.viewmat(),
-            lens: Lens::Pinhole,
-            image: Arc::new(pixels),
-            mask: None,
-        },
-        transparent,
-        suspect,
-        rescaled: (size != camera_size).then_some([size, camera_size]),
-    })
+    /// Colour behind transparent pixels; `None` if alpha is a mask.
+    background: Option<[f32; 3]>,
 }
 
-/// A photo file in memory.
-struct PhotoFile {
-    bytes: Vec<u8>,
-    format: ImageFormat,
-}
-
-impl PhotoFile {
-    fn open(path: &Path) -> Result<Self, CaptureError> {
-        let bytes = std::fs::read(path).map_err(|source| CaptureError::Io {
-            path: path.to_path_buf(),
-            source,
-        })?;
-        let format = image::guess_format(&bytes).map_err(|error| undecodable(path, &error))?;
-        Ok(Self { bytes, format })
-    }
-
-    /// Width and height.
-    fn size(&self, path: &Path) -> Result<[u32; 2], CaptureError> {
-        let size = self.reader().into_dimensions();
-        size.map(<[u32; 2]>::from)
-            .map_err(|error| undecodable(path, &error))
-    }
-
-    /// Refuses a photo with a missing part that the decoder would accept; returns true if the file
-    /// looks damaged anyway. (PNG files have checksums, which the decoder verifies.)
-    fn check_whole(&mut self, path: &Path) -> Result<bool, CaptureError> {
-        if self.format != ImageFormat::Jpeg {
-            return Ok(false);
+impl Loader<'_> {
+    fn load(&self, image: &SparseImage, camera: &SparseCamera) -> Result<Loaded, CaptureError> {
+        let path = self.folder.join(&image.name);
+        let mut file = PhotoFile::open(&path)?;
+        let size = file.size(&path)?;
+        let camera_size = camera.intrinsics.size().unwrap_or(size);
+        let Some(mut intrinsics) = camera.intrinsics.fit(size) else {
+            return Err(CaptureError::PhotoSize {
+                path,
+                photo: size,
+                camera_id: camera.id,
+                camera: camera_size,
+            });
+        };
+        let suspect = file.check_whole(&path)?;
+        let (mut pixels, mut alpha) = rgb_and_alpha(file.decode(&path)?);
+        if let Some(background) = self.background
+            && let Some(alpha) = alpha.take()
+        {
+            composite(&mut pixels, &alpha, background);
         }
-        let whole = jpeg::check(&self.bytes).map_err(|reason| CaptureError::IncompletePhoto {
-            path: path.to_path_buf(),
-            reason,
-        })?;
-        if !whole.ended {
-            // Without the end marker the decoder invents the last rows, although they are present.
-            self.bytes.extend(jpeg::END);
+        let transparent = alpha.is_some();
+        let mask = self
+            .masks
+            .file(image)
+            .map(|mask| masks::read(&mask, &path, size));
+        let mut mask = masks::combined(alpha, mask.transpose()?);
+        let [mut width, mut height] = size;
+        if self.factor > 1 {
+            let whole = downscale::Picture {
+                pixels: &pixels,
+                mask: mask.as_deref(),
+                width,
+                height,
+            };
+            (pixels, mask) = downscale::area_average(&whole, self.factor);
+            [width, height] = size.map(|side| side / self.factor);
+            intrinsics = downscale::intrinsics(intrinsics, self.factor);
         }
-        Ok(whole.suspect)
-    }
-
-    /// The photo as stored. Like COLMAP, this ignores EXIF orientation.
-    fn decode(&self, path: &Path) -> Result<DynamicImage, CaptureError> {
-        self.reader()
-            .decode()
-            .map_err(|error| undecodable(path, &error))
-    }
-
-    fn reader(&self) -> ImageReader<Cursor<&[u8]>> {
-        ImageReader::with_format(Cursor::new(&self.bytes), self.format)
-    }
-}
-
-fn undecodable(path: &Path, error: &ImageError) -> CaptureError {
-    CaptureError::UndecodablePhoto {
-        path: path.to_path_buf(),
-        reason: error.to_string().replace('\n', " "),
-    }
-}
-
-/// The camera's intrinsics for a photo of `size`, or `None` if the aspect ratios differ.
-///
-/// A rescale counts as uniform if one factor explains both sides to within a pixel (sizes are
-/// rounded). Each side is then scaled by its own ratio, so that the photo's edges stay the camera's
-/// edges.
-fn fit_intrinsics(camera: &SparseCamera, size: [u32; 2]) -> Option<[f64; 4]> {
-    let [fx, fy, cx, cy] = camera.intrinsics;
-    let [w, h] = size.map(f64::from);
-    let [cam_w, cam_h] = [camera.width, camera.height].map(f64::from);
-    let least = ((w - 1.0) / cam_w).max((h - 1.0) / cam_h);
-    let most = ((w + 1.0) / cam_w).min((h + 1.0) / cam_h);
-    let (sx, sy) = (w / cam_w, h / cam_h);
-    (least <= most).then_some([fx * sx, fy * sy, cx * sx, cy * sy])
-}
-
-/// 8-bit RGB with transparent pixels composited on black; and whether there were any.
-fn opaque_rgb(photo: DynamicImage) -> (Vec<u8>, bool) {
-    if !photo.color().has_alpha() {
-        return (photo.into_rgb8().into_raw(), false);
-    }
-    let rgba = photo.into_rgba8();
-    let transparent = rgba.pixels().any(|pixel| pixel.0[3] != 255);
-    let on_black = |value: u8, alpha: u8| ((u32::from(value) * u32::from(alpha) + 127) / 255) as u8;
-    let pixels = rgba
-        .pixels()
-        .flat_map(|pixel| {
-            let [r, g, b, a] = pixel.0;
-            [on_black(r, a), on_black(g, a), on_black(b, a)]
+        if width < MIN_SIDE || height < MIN_SIDE {
+            return Err(CaptureError::PhotoTooSmall {
+                path,
+                size: [width, height],
+                downscale: self.factor,
+                min: MIN_SIDE,
+            });
+        }
+        let mask = mask.filter(|mask| mask.iter().any(|&value| value != 255));
+        Ok(Loaded {
+            empty_mask: mask
+                .as_ref()
+                .is_some_and(|mask| mask.iter().all(|&value| value == 0)),
+            view: View {
+                name: image.name.clone(),
+                width,
+                height,
+                intrinsics,
+                viewmat: image.viewmat,
+                lens: camera.lens,
+                image: Arc::new(pixels),
+                mask: mask.map(Arc::new),
+                depth: image.depth.clone(),
+            },
+            transparent,
+            suspect,
+            rescaled: (size != camera_size).then_some([size, camera_size]),
         })
-        .collect();
-    (pixels, transparent)
+    }
+}
+
+/// Puts pixels with alpha on a colour, rounded to the nearest.
+fn composite(pixels: &mut [u8], alpha: &[u8], background: [f32; 3]) {
+    let background = background.map(|value| (255.0 * value).round() as u32);
+    for (pixel, &alpha) in pixels.chunks_exact_mut(3).zip(alpha) {
+        let alpha = u32::from(alpha);
+        for (value, background) in pixel.iter_mut().zip(background) {
+            *value = ((u32::from(*value) * alpha + background * (255 - alpha) + 127) / 255) as u8;
+        }
+    }
 }
 
 fn rescaled(loaded: &[Loaded]) -> Option<CaptureWarning> {
@@ -271,23 +250,5 @@ fn rescaled(loaded: &[Loaded]) -> Option<CaptureWarning> {
         first: first.clone(),
         photo,
         camera,
-    })
-}
-
-fn transparent(loaded: &[Loaded]) -> Option<CaptureWarning> {
-    let mut odd = loaded.iter().filter(|loaded| loaded.transparent);
-    let first = odd.next()?.view.name.clone();
-    Some(CaptureWarning::TransparentPhotos {
-        count: 1 + odd.count(),
-        first,
-    })
-}
-
-fn damaged(loaded: &[Loaded]) -> Option<CaptureWarning> {
-    let mut odd = loaded.iter().filter(|loaded| loaded.suspect);
-    let first = odd.next()?.view.name.clone();
-    Some(CaptureWarning::DamagedPhotos {
-        count: 1 + odd.count(),
-        first,
     })
 }

@@ -1,16 +1,21 @@
 //! Captures: photos with their cameras and the points from structure from motion.
 //!
-//! [`Capture::load`] reads a folder in COLMAP's layout, decodes every photo once in parallel, and
-//! returns plain data, without tensors or printed output. Problems that can be tolerated are
-//! returned as [`Capture::warnings`]; others are a [`CaptureError`] that names the file, the record
-//! and the remedy.
+//! [`Capture::load`] reads a folder in COLMAP's layout, or with `transforms.json` (nerfstudio,
+//! instant-ngp, Blender), decodes every photo once in parallel, and returns plain data, without
+//! tensors or printed output. Problems that can be tolerated are returned as [`Capture::warnings`];
+//! others are a [`CaptureError`] that names the file, the record and the remedy.
+//!
+//! Which files are read, and what their fields mean, is in `docs/CAPTURES.md`.
 //!
 //! Conventions (project-wide): right-handed world; camera axes +x right, +y down, +z forward; the
 //! view matrix maps world to camera; the centre of pixel (i, j) is at (i + 0.5, j + 0.5).
 
 mod colmap;
 mod colmap_binary;
+mod colmap_checks;
+mod colmap_folder;
 mod colmap_models;
+mod colmap_records;
 mod colmap_text;
 mod downscale;
 mod error;
@@ -20,10 +25,17 @@ mod images;
 #[doc(hidden)]
 pub mod in_memory;
 mod jpeg;
+mod lens_checks;
+mod masks;
+mod photo_file;
+mod points_file;
+mod random_points;
 mod save;
 mod sparse_model;
 mod split;
+mod transforms;
 mod undistort;
+mod warning;
 
 use derive_setters::Setters;
 use std::collections::HashMap;
@@ -34,9 +46,11 @@ use glam::{DMat4, DVec4};
 use splat_core::{ImageSize, Lens};
 
 use crate::Camera;
+use random_points::Room;
 
-pub use error::{CaptureError, CaptureWarning};
-pub use split::Split;
+pub use error::CaptureError;
+pub use split::{Split, SplitRule};
+pub use warning::CaptureWarning;
 
 /// A photo capture in memory: all photos with their cameras, the sparse points, and the held-out
 /// split.
@@ -50,18 +64,26 @@ pub struct Capture {
     pub photos: PathBuf,
     /// All views, sorted by [`View::name`]. Never empty.
     pub views: Vec<View>,
-    /// Points of structure from motion, in file order. Never empty.
+    /// Points of structure from motion, in file order; random ones, with a warning, if the capture
+    /// has none. Never empty.
     pub points: Vec<Point>,
+    /// Colour behind the scene, from 0 to 1, if the capture has one: white for a Blender capture,
+    /// whose transparent photos were composited on it. `None` for photos of the real world.
+    pub background: Option<[f32; 3]>,
     /// Indices into [`Capture::views`]: for training, and held out.
     pub split: Split,
     /// Problems that did not prevent reading.
     pub warnings: Vec<CaptureWarning>,
 }
 
+/// Is told the number of photos that are done, and of all.
+type Progress<'a> = &'a (dyn Fn(usize, usize) + Sync);
+
 /// One photo and the camera that took it.
 #[derive(Debug, Clone)]
 pub struct View {
-    /// Name of the photo in the capture, relative to the folder of the photos.
+    /// Name of the photo in the capture, relative to the folder of the photos, from which it never
+    /// leads out.
     pub name: String,
     /// Width of `image` in pixels.
     pub width: u32,
@@ -79,6 +101,8 @@ pub struct View {
     pub image: Arc<Vec<u8>>,
     /// Which pixels count, `width * height` bytes from 0 (ignored) to 255; `None` if all do.
     pub mask: Option<Arc<Vec<u8>>>,
+    /// The depth map that the capture names, if any. It exists, and is not read here.
+    pub depth: Option<PathBuf>,
 }
 
 /// A point of structure from motion.
@@ -99,6 +123,8 @@ pub struct CaptureSettings {
     /// Folder of the photos, relative to the capture or absolute. Default: `images`, or the
     /// capture's folder if that does not exist.
     pub images: Option<PathBuf>,
+    /// Which views are held out of training. Default: those that the capture says.
+    pub split: SplitRule,
 }
 
 impl CaptureSettings {
@@ -113,22 +139,31 @@ impl Default for CaptureSettings {
         Self {
             downscale: 1,
             images: None,
+            split: SplitRule::default(),
         }
     }
 }
 
 impl Capture {
-    /// Reads the capture in the folder `root`.
+    /// Reads the capture in the folder `root`, or the `transforms.json` that `root` is.
     ///
-    /// The COLMAP model is searched in `sparse/0`, `sparse` and `root`, binary before text; the
-    /// photos in [`CaptureSettings::images`]. Cameras must be `PINHOLE` or `SIMPLE_PINHOLE`. If a
-    /// photo's size is a uniform rescale of its camera's, the intrinsics are scaled to the photo,
-    /// with a warning. Photos with a missing part are refused. The held-out views are those named
-    /// by `split.json`, or else every 8th by name from the first.
+    /// Read is the first of these that the folder has; a warning names others:
     ///
-    /// Reading a model takes less than 32 times the memory of its files, and a JPEG file 64 times,
-    /// while it is read. The pixels of the photos take three bytes each in addition, and up to
-    /// twelve while a photo is decoded.
+    /// 1. a COLMAP model in a numbered folder of `sparse`, of which the one with the most images
+    ///    counts, or in `sparse` or `root`, binary before text;
+    /// 2. `transforms_train.json`, with `transforms_test.json`, or else `transforms_val.json`, held
+    ///    out;
+    /// 3. `transforms.json`.
+    ///
+    /// If a photo's size is a uniform rescale of its camera's, the intrinsics are scaled to the
+    /// photo, with a warning. Photos are JPEG, PNG, WebP or TIFF, and are kept as 8-bit RGB. A
+    /// photo with a missing part is refused. Alpha and masks become [`View::mask`]; Blender's
+    /// pictures are composited on white instead ([`Capture::background`]). A capture without points
+    /// gets random ones, with a warning.
+    ///
+    /// Reading a COLMAP model takes less than 32 times the memory of its files, a `transforms.json`
+    /// 128 times, and a JPEG file 64 times, while it is read. The pixels of the photos take three
+    /// bytes each in addition, or four with masks, and up to twelve while a photo is decoded.
     ///
     /// ```
     /// use splat_data::{Capture, CaptureSettings};
@@ -144,21 +179,72 @@ impl Capture {
     /// [`CaptureError`] if the capture is unusable. A capture of a single photo can be read;
     /// [`Capture::check_trainable`] decides whether it can be trained.
     pub fn load(root: impl AsRef<Path>, options: &CaptureSettings) -> Result<Self, CaptureError> {
-        let root = root.as_ref();
+        Self::load_with_progress(root, options, &|_, _| {})
+    }
+
+    /// [`Capture::load`], which calls `progress` with the number of photos that are decoded and
+    /// that of all photos, after each of them and from several threads.
+    ///
+    /// ```
+    /// use std::sync::atomic::{AtomicUsize, Ordering};
+    ///
+    /// use splat_data::{Capture, CaptureSettings};
+    ///
+    /// # let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
+    /// let calls = AtomicUsize::new(0);
+    /// let progress = |done: usize, total: usize| {
+    ///     assert!(done <= total);
+    ///     calls.fetch_add(1, Ordering::Relaxed);
+    /// };
+    /// let options = CaptureSettings::new().with_downscale(16);
+    /// let capture = Capture::load_with_progress(folder, &options, &progress)?;
+    /// assert_eq!(calls.into_inner(), capture.views.len());
+    /// # Ok::<(), splat_data::CaptureError>(())
+    /// ```
+    ///
+    /// # Errors
+    ///
+    /// Those of [`Capture::load`].
+    pub fn load_with_progress(
+        root: impl AsRef<Path>,
+        options: &CaptureSettings,
+        progress: &(dyn Fn(usize, usize) + Sync),
+    ) -> Result<Self, CaptureError> {
         if options.downscale == 0 {
             return Err(CaptureError::ZeroDownscale);
         }
-        let (model, mut warnings) = formats::read(root)?;
+        let (mut model, mut warnings) = formats::read(root.as_ref(), options)?;
+        let root = match root.as_ref() {
+            file if file.is_file() => match file.parent() {
+                Some(folder) if !folder.as_os_str().is_empty() => folder,
+                _ => Path::new("."),
+            },
+            folder => folder,
+        };
         let photos = images::folder(root, &model, options)?;
-        let views = images::load(root, &photos, &model, options, &mut warnings)?;
+        let views = images::load(root, &photos, &model, options, progress, &mut warnings)?;
+        warnings.extend(lens_checks::fold_back(&model, &views));
+        if model.points.is_empty() {
+            let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
+            let room = model.room.unwrap_or_else(|| Room::of_cameras(&cameras));
+            model.points = random_points::draw(room, random_points::COUNT);
+            warnings.push(room.warning());
+        }
         let names: Vec<&str> = views.iter().map(|view| view.name.as_str()).collect();
-        let split = Split::of_capture(root, &names, &mut warnings)?;
+        let split = Split::by_rule(
+            &options.split,
+            root,
+            &names,
+            model.split.as_ref(),
+            &mut warnings,
+        )?;
         Ok(Self {
             name: folder_name(root),
             root: root.to_path_buf(),
             photos,
             split,
             points: model.points,
+            background: model.background,
             views,
             warnings,
         })
@@ -211,6 +297,11 @@ impl Capture {
 }
 
 impl View {
+    /// Number of pixels.
+    pub(crate) fn pixel_count(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
     /// Camera of the view.
     pub fn camera(&self) -> Camera {
         let [r0, r1, r2, r3] = self.viewmat.map(DVec4::from_array);
@@ -261,17 +352,23 @@ impl View {
         if factor <= 1 {
             return self.clone();
         }
-        let (image, width, height) =
-            downscale::area_average(&self.image, self.width, self.height, factor);
+        let whole = downscale::Picture {
+            pixels: &self.image,
+            mask: self.mask.as_ref().map(|mask| mask.as_slice()),
+            width: self.width,
+            height: self.height,
+        };
+        let (image, mask) = downscale::area_average(&whole, factor);
         Self {
             name: self.name.clone(),
-            width,
-            height,
+            width: self.width / factor,
+            height: self.height / factor,
             intrinsics: downscale::intrinsics(self.intrinsics, factor),
             viewmat: self.viewmat,
             lens: self.lens,
             image: Arc::new(image),
-            mask: None,
+            mask: mask.map(Arc::new),
+            depth: self.depth.clone(),
         }
     }
 
@@ -306,7 +403,11 @@ fn folder_name(root: &Path) -> String {
 }
 
 #[cfg(test)]
+mod mask_tests;
+#[cfg(test)]
 mod photo_tests;
+#[cfg(test)]
+mod split_tests;
 #[cfg(test)]
 mod test_capture;
 #[cfg(test)]

@@ -12,6 +12,8 @@ use super::*;
 /// First photo by name, of the size of the first camera.
 const FIRST: &str = "view r.png";
 
+const LOSSY_WEBP: &[u8] = include_bytes!("testdata/lossy.webp");
+
 fn good() -> (TempDir, TestCapture) {
     let root = TempDir::new().unwrap();
     let capture = TestCapture::new();
@@ -48,13 +50,15 @@ fn photos_that_memory_cannot_hold_are_refused_before_they_are_read() {
     let (root, _) = good();
     let capture = load(root.path()).unwrap();
     let bytes: u64 = capture.views.iter().map(|v| v.image.len() as u64).sum();
-    let (mut model, _) = colmap::read(root.path()).unwrap();
+    let (mut model, _) = colmap::read(root.path(), &CaptureSettings::new()).unwrap();
     let check = |model: &sparse_model::SparseModel, factor: u32, left: Option<u64>| {
         let folder = root.path().join("images");
         images::check_memory(root.path(), &folder, model, factor, left)
     };
     for camera in model.cameras.values_mut() {
-        (camera.width, camera.height) = (u32::MAX, u32::MAX);
+        if let sparse_model::Intrinsics::Pixels { size, .. } = &mut camera.intrinsics {
+            *size = [u32::MAX; 2];
+        }
     }
     assert!(check(&model, 1, Some(bytes)).is_ok());
     assert!(check(&model, 1, None).is_ok());
@@ -71,8 +75,14 @@ fn photos_that_memory_cannot_hold_are_refused_before_they_are_read() {
 fn a_part_of_a_photo_is_refused_by_name() {
     let (root, _) = good();
     let path = root.path().join("images").join(FIRST);
-    for format in [ImageFormat::Jpeg, ImageFormat::Png] {
-        let bytes = photo(format);
+    let files = [
+        (ImageFormat::Jpeg, photo(ImageFormat::Jpeg)),
+        (ImageFormat::Png, photo(ImageFormat::Png)),
+        (ImageFormat::WebP, photo(ImageFormat::WebP)),
+        (ImageFormat::WebP, LOSSY_WEBP.to_vec()),
+        (ImageFormat::Tiff, photo(ImageFormat::Tiff)),
+    ];
+    for (format, bytes) in files {
         std::fs::write(&path, &bytes).unwrap();
         let whole = load(root.path()).unwrap();
         assert_eq!(whole.warnings, []);
@@ -96,13 +106,112 @@ fn a_part_of_a_photo_is_refused_by_name() {
                 }
             }
         }
-        // Everything except what follows the last pixel.
+        // Everything except what follows the last pixel, which in TIFF is a directory.
         assert!(
             refused + 16 >= bytes.len(),
             "{format:?}: {refused} of {}",
             bytes.len()
         );
     }
+}
+
+/// The same picture in many kinds of files, see `testdata/generate.py`.
+#[test]
+fn photos_of_every_kind_are_read() {
+    let (root, _) = good();
+    let path = root.path().join("images").join(FIRST);
+    let colors = [[255, 255, 255], [200, 40, 30], [20, 60, 180], [0, 0, 0]];
+    let black_and_white = [[255; 3], [0; 3], [0; 3], [0; 3]];
+    let kinds: [(&str, &[u8]); 12] = [
+        ("cmyk_adobe.jpg", include_bytes!("testdata/cmyk_adobe.jpg")),
+        ("ycck_adobe.jpg", include_bytes!("testdata/ycck_adobe.jpg")),
+        ("palette.png", include_bytes!("testdata/palette.png")),
+        (
+            "palette_transparent.png",
+            include_bytes!("testdata/palette_transparent.png"),
+        ),
+        ("bilevel.png", include_bytes!("testdata/bilevel.png")),
+        ("lossy.webp", LOSSY_WEBP),
+        (
+            "lossy_alpha.webp",
+            include_bytes!("testdata/lossy_alpha.webp"),
+        ),
+        ("lossless.webp", include_bytes!("testdata/lossless.webp")),
+        ("lzw.tiff", include_bytes!("testdata/lzw.tiff")),
+        ("deflate.tiff", include_bytes!("testdata/deflate.tiff")),
+        ("jpeg.tiff", include_bytes!("testdata/jpeg.tiff")),
+        ("cmyk.tiff", include_bytes!("testdata/cmyk.tiff")),
+    ];
+    for (name, bytes) in kinds {
+        std::fs::write(&path, bytes).unwrap();
+        let view = &load(root.path()).unwrap().views[0];
+        let expected = match name {
+            "bilevel.png" => black_and_white,
+            _ => colors,
+        };
+        let places = [(5, 5), (25, 5), (5, 20), (25, 20)].map(|(x, y)| 32 * y + x);
+        for (at, expected) in places.iter().zip(expected) {
+            let found = &view.image[3 * at..3 * at + 3];
+            let off = found.iter().zip(expected).map(|(a, b)| a.abs_diff(b));
+            assert!(off.max() <= Some(2), "{name}: {found:?} for {expected:?}");
+        }
+        let counts = |at: &usize| view.mask.as_ref().map(|mask| mask[*at]);
+        let masks = match name {
+            "palette_transparent.png" => [0, 255, 255, 255].map(Some),
+            "lossy_alpha.webp" => [255, 128, 0, 255].map(Some),
+            _ => [None; 4],
+        };
+        assert_eq!(places.each_ref().map(counts), masks, "{name}");
+    }
+}
+
+/// Grey and colour, with and without alpha, of 8 and 16 bits, which are rounded to the nearest.
+#[test]
+fn values_of_sixteen_bits_are_rounded() {
+    let (root, _) = good();
+    let path = root.path().join("images").join(FIRST);
+    let [w, h] = SIZES[0];
+    let value = |x: u32, y: u32| (x * 2111 + y * 1373) as u16;
+    let narrow = |value: u16| (f64::from(value) * 255.0 / 65_535.0).round() as u8;
+    let at = |x: u32, y: u32| (y * w + x) as usize;
+    let check = |photo: image::DynamicImage, colored: bool, alpha: bool| {
+        for format in [ImageFormat::Png, ImageFormat::Tiff] {
+            // The encoder of TIFF knows no grey with alpha.
+            if format == ImageFormat::Tiff && alpha && !colored {
+                continue;
+            }
+            photo.save_with_format(&path, format).unwrap();
+            let view = &load(root.path()).unwrap().views[0];
+            for (x, y) in [(0, 0), (1, 0), (7, 5), (31, 23), (16, 20)] {
+                let first = narrow(value(x, y));
+                let second = if colored {
+                    narrow(value(x, y) / 2)
+                } else {
+                    first
+                };
+                let found = &view.image[3 * at(x, y)..][..3];
+                assert_eq!(found, [first, second, first], "{format:?}");
+                let mask = view.mask.as_ref().map(|mask| mask[at(x, y)]);
+                assert_eq!(mask, alpha.then(|| narrow(!value(x, y))), "{format:?}");
+            }
+        }
+    };
+    let rgb = |x, y| [value(x, y), value(x, y) / 2, value(x, y)];
+    let grey = image::ImageBuffer::from_fn(w, h, |x, y| image::Luma([value(x, y)]));
+    check(grey.into(), false, false);
+    let with_alpha = |x, y| image::LumaA([value(x, y), !value(x, y)]);
+    let grey = image::ImageBuffer::from_fn(w, h, with_alpha);
+    check(grey.into(), false, true);
+    let color = image::ImageBuffer::from_fn(w, h, |x, y| image::Rgb(rgb(x, y)));
+    check(color.into(), true, false);
+    let with_alpha = |x, y| {
+        let [r, g, b] = rgb(x, y);
+        image::Rgba([r, g, b, !value(x, y)])
+    };
+    let color = image::ImageBuffer::from_fn(w, h, with_alpha);
+    check(color.into(), true, true);
+    let eight = image::GrayImage::from_fn(w, h, |x, y| image::Luma([narrow(value(x, y))]));
+    check(eight.into(), false, false);
 }
 
 #[test]

@@ -1,10 +1,11 @@
 //! The split into training and held-out views.
 
 use std::collections::{HashMap, HashSet};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
+use super::sparse_model::NamedSplit;
 use super::{CaptureError, CaptureWarning};
-use crate::text::without_mark;
+use crate::text::{lines, utf8};
 
 /// Default interval of held-out views.
 const HOLD_OUT_EVERY: usize = 8;
@@ -18,6 +19,38 @@ pub struct Split {
     pub test: Vec<usize>,
 }
 
+/// Which views are held out of training.
+///
+/// ```
+/// use splat_data::{Capture, CaptureSettings, SplitRule};
+///
+/// # let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
+/// let options = CaptureSettings::new()
+///     .with_downscale(16)
+///     .with_split(SplitRule::Every(0));
+/// let capture = Capture::load(folder, &options)?;
+/// assert_eq!(capture.split.train.len(), capture.views.len());
+/// # Ok::<(), splat_data::CaptureError>(())
+/// ```
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+#[non_exhaustive]
+pub enum SplitRule {
+    /// What the capture says: its `split.json`, or else its format's own split (Blender's files, or
+    /// `train_filenames`, `test_filenames` and `val_filenames`), or else every 8th view by name
+    /// from the first.
+    #[default]
+    OfCapture,
+    /// Every k-th view by name, from the first; none for 0.
+    Every(usize),
+    /// The views of these names. Names that the capture does not have are a warning, or an error if
+    /// it has none of them.
+    Names(Vec<String>),
+    /// The views that a file names, relative to the working directory: a file like `split.json`
+    /// with the lists `train` and `test`, or a text of one held-out name per line, in which empty
+    /// lines and those after `#` are comments.
+    File(PathBuf),
+}
+
 /// `split.json`: two lists of photo names. Other keys (such as `rule`) are comments.
 #[derive(serde::Deserialize)]
 struct SplitFile {
@@ -28,33 +61,78 @@ struct SplitFile {
 impl Split {
     /// The default split of `count` views sorted by name: every 8th from the first is held out.
     pub fn every_eighth(count: usize) -> Self {
-        let (test, train) = (0..count).partition(|index| index % HOLD_OUT_EVERY == 0);
+        Self::every(count, HOLD_OUT_EVERY)
+    }
+
+    /// Every `interval`-th of `count` views sorted by name is held out, from the first; none if
+    /// `interval` is 0.
+    pub fn every(count: usize, interval: usize) -> Self {
+        let held_out = |&index: &usize| interval > 0 && index.is_multiple_of(interval);
+        let (test, train) = (0..count).partition(held_out);
         Self { train, test }
     }
 
-    /// The split named by `split.json` in `root`, or the default one if there is no such file.
-    /// `names` are the photos' names, sorted.
-    pub(super) fn of_capture(
+    /// The split by this rule. `names` are the photos' names, sorted, and `own` is the split of the
+    /// capture's format.
+    pub(super) fn by_rule(
+        rule: &SplitRule,
         root: &Path,
         names: &[&str],
+        own: Option<&NamedSplit>,
         warnings: &mut Vec<CaptureWarning>,
     ) -> Result<Self, CaptureError> {
-        let path = root.join("split.json");
-        if !path.exists() {
-            return Ok(Self::every_eighth(names.len()));
+        let usual = root.join("split.json");
+        match rule {
+            SplitRule::Every(interval) => Ok(Self::every(names.len(), *interval)),
+            SplitRule::Names(held_out) => {
+                let lists = NamedSplit {
+                    source: "the list of held-out photos".to_owned(),
+                    train: None,
+                    test: held_out.clone(),
+                };
+                Self::requested(root, names, &lists, warnings)
+            }
+            SplitRule::File(path) => Self::requested(path, names, &read(path)?, warnings),
+            SplitRule::OfCapture if usual.exists() => {
+                Self::named(&usual, names, &read(&usual)?, warnings)
+            }
+            SplitRule::OfCapture => match own {
+                Some(own) => Self::named(root, names, own, warnings),
+                None => Ok(Self::every_eighth(names.len())),
+            },
         }
-        let bad = |reason: String| CaptureError::BadSplit {
-            path: path.clone(),
-            reason,
-        };
-        let bytes = std::fs::read(&path).map_err(|error| bad(error.to_string()))?;
-        let text = without_mark(&bytes).map_err(|reason| bad(reason.to_owned()))?;
-        let file: SplitFile = serde_json::from_slice(text).map_err(|error| {
-            bad(format!(
-                "not a split (an object with the lists `train` and `test` of photo names): {error}"
-            ))
-        })?;
+    }
 
+    /// A split that was asked for, which therefore must fit at least one photo.
+    fn requested(
+        path: &Path,
+        names: &[&str],
+        lists: &NamedSplit,
+        warnings: &mut Vec<CaptureWarning>,
+    ) -> Result<Self, CaptureError> {
+        let known: HashSet<&str> = names.iter().copied().collect();
+        match lists.test.first() {
+            Some(first) if !lists.test.iter().any(|name| known.contains(name.as_str())) => {
+                Err(bad(
+                    path,
+                    format!(
+                        "the capture has none of the {} held-out photo(s), from `{first}`; names are as in the capture, such as `{}`",
+                        lists.test.len(),
+                        names.first().unwrap_or(&"")
+                    ),
+                ))
+            }
+            _ => Self::named(path, names, lists, warnings),
+        }
+    }
+
+    /// The split of a list of names. `path` is used in messages.
+    fn named(
+        path: &Path,
+        names: &[&str],
+        lists: &NamedSplit,
+        warnings: &mut Vec<CaptureWarning>,
+    ) -> Result<Self, CaptureError> {
         let index_of: HashMap<&str, usize> = names
             .iter()
             .enumerate()
@@ -67,31 +145,71 @@ impl Split {
             for name in list {
                 match index_of.get(name.as_str()) {
                     Some(&index) if seen.insert(index) => indices.push(index),
-                    Some(_) => return Err(bad(format!("names the photo `{name}` twice"))),
+                    Some(_) => return Err(bad(path, format!("names the photo `{name}` twice"))),
                     None => unknown.push(name.clone()),
                 }
             }
             indices.sort_unstable();
             Ok(indices)
         };
-        let split = Self {
-            train: indices(&file.train)?,
-            test: indices(&file.test)?,
-        };
-
+        let test = indices(&lists.test)?;
+        let train = lists.train.as_deref().map(&mut indices).transpose()?;
         if let Some(first) = unknown.first() {
             warnings.push(CaptureWarning::SplitNamesUnknown {
+                source: lists.source.clone(),
                 count: unknown.len(),
                 first: first.clone(),
             });
         }
-        let left_out = |index: &usize| !seen.contains(index);
-        if let Some(first) = (0..names.len()).find(left_out) {
+        let rest: Vec<usize> = (0..names.len()).filter(|i| !seen.contains(i)).collect();
+        let Some(train) = train else {
+            return Ok(Self { train: rest, test });
+        };
+        if let Some(&first) = rest.first() {
             warnings.push(CaptureWarning::SplitLeavesOut {
-                count: (0..names.len()).filter(left_out).count(),
+                source: lists.source.clone(),
+                count: rest.len(),
                 first: names[first].to_owned(),
             });
         }
-        Ok(split)
+        Ok(Self { train, test })
     }
+}
+
+fn bad(path: &Path, reason: String) -> CaptureError {
+    CaptureError::BadSplit {
+        path: path.to_path_buf(),
+        reason,
+    }
+}
+
+/// The lists of a file: of JSON by its name or its first character, or else of names in lines.
+fn read(path: &Path) -> Result<NamedSplit, CaptureError> {
+    let bytes = std::fs::read(path).map_err(|error| bad(path, error.to_string()))?;
+    let text = utf8(&bytes).map_err(|reason| bad(path, reason))?;
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    let is_json = path
+        .extension()
+        .is_some_and(|ending| ending.eq_ignore_ascii_case("json"));
+    let (train, test) = if is_json || text.trim_start().starts_with('{') {
+        let file: SplitFile = serde_json::from_str(text).map_err(|error| {
+            bad(
+                path,
+                format!(
+                    "not a split (an object with the lists `train` and `test` of photo names): {error}"
+                ),
+            )
+        })?;
+        (Some(file.train), file.test)
+    } else {
+        let lines = lines(text.as_bytes()).filter(|(_, line)| !line.is_empty());
+        let named = lines.filter(|(_, line)| !line.starts_with(b"#"));
+        let name = |(_, line): (usize, &[u8])| String::from_utf8_lossy(line).into_owned();
+        (None, named.map(name).collect())
+    };
+    Ok(NamedSplit {
+        source: name.into_owned(),
+        train,
+        test,
+    })
 }

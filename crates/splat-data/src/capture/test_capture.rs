@@ -136,6 +136,17 @@ impl TestCapture {
             "SIMPLE_RADIAL",
             "RADIAL",
             "OPENCV",
+            "OPENCV_FISHEYE",
+            "FULL_OPENCV",
+            "FOV",
+            "SIMPLE_RADIAL_FISHEYE",
+            "RADIAL_FISHEYE",
+            "",
+            "",
+            "",
+            "",
+            "SIMPLE_FISHEYE",
+            "FISHEYE",
         ];
         let mut cameras = String::from("# Camera list\n#   CAMERA_ID, MODEL, ...\n");
         for (id, model, width, height, parameters) in &self.cameras {

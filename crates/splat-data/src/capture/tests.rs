@@ -40,49 +40,58 @@ fn text_and_binary_are_the_same_model() {
     let root = TempDir::new().unwrap();
     let model = TestCapture::new();
     model.write_binary(&root.path().join("sparse/0"));
-    let (binary, _) = colmap::read(root.path()).unwrap();
+    let (binary, _) = colmap::read(root.path(), &CaptureSettings::new()).unwrap();
     std::fs::remove_dir_all(root.path().join("sparse")).unwrap();
     model.write_text(&root.path().join("sparse"));
-    let (text, _) = colmap::read(root.path()).unwrap();
+    let (text, _) = colmap::read(root.path(), &CaptureSettings::new()).unwrap();
     assert_eq!(binary, text);
 
     assert_eq!(binary.images.len(), 9);
     assert_eq!(binary.images[0].name, "view r.png");
     assert_eq!(binary.images[0].id, 92);
     assert_eq!(binary.images[0].camera_id, 7);
-    assert_eq!(binary.cameras[&2].intrinsics, [33.0, 33.0, 12.0, 15.0]);
+    let pixels = sparse_model::Intrinsics::Pixels {
+        size: SIZES[1],
+        values: [33.0, 33.0, 12.0, 15.0],
+    };
+    assert_eq!(binary.cameras[&2].intrinsics, pixels);
     assert_eq!(binary.points[3].color, [3, 255, 30]);
     assert_eq!(binary.points[3].position, [1.0, -3e-7, 1e6 - 3.0]);
 }
 
 #[test]
 fn the_example_is_the_same_as_text() {
-    let (binary, _) = colmap::read(&example()).unwrap();
-    let parameters = |camera: &sparse_model::SparseCamera| camera.intrinsics.to_vec();
+    let file = |name: &str| {
+        let path = example().join("sparse/0").join(name);
+        (std::fs::read(&path).unwrap(), path)
+    };
+    let (cameras, path) = file("cameras.bin");
+    let cameras = colmap_binary::parse_cameras(&path, &cameras).unwrap();
+    let (images, path) = file("images.bin");
+    let images = colmap_binary::parse_images(&path, &images).unwrap();
+    let (binary, _) = colmap::read(&example(), &CaptureSettings::new()).unwrap();
     let text = TestCapture {
-        cameras: binary
-            .cameras
-            .values()
-            .map(|c| (c.id, 1, c.width.into(), c.height.into(), parameters(c)))
-            .collect(),
-        images: binary
-            .images
+        cameras: cameras
             .iter()
-            .map(|i| {
+            .map(|c| {
                 (
-                    i.id,
-                    i.quaternion,
-                    i.translation,
-                    i.camera_id,
-                    i.name.clone(),
+                    c.id,
+                    1,
+                    c.width.into(),
+                    c.height.into(),
+                    c.intrinsics.to_vec(),
                 )
             })
+            .collect(),
+        images: images
+            .into_iter()
+            .map(|i| (i.id, i.quaternion, i.translation, i.camera_id, i.name))
             .collect(),
         points: (0..).zip(binary.points.iter().copied()).collect(),
     };
     let root = TempDir::new().unwrap();
     text.write_text(&root.path().join("sparse/0"));
-    let (text, _) = colmap::read(root.path()).unwrap();
+    let (text, _) = colmap::read(root.path(), &CaptureSettings::new()).unwrap();
     assert_eq!(binary, text);
 }
 
@@ -157,67 +166,6 @@ fn photos_are_kept_as_they_are() {
 }
 
 #[test]
-fn every_eighth_view_is_held_out() {
-    let (root, _) = good();
-    let split = load(root.path()).unwrap().split;
-    assert_eq!(split.test, [0, 8]);
-    assert_eq!(split.train, [1, 2, 3, 4, 5, 6, 7]);
-}
-
-#[test]
-fn a_named_split_is_followed() {
-    let (root, _) = good();
-    let path = root.path().join("split.json");
-    let json = r#"{"rule": "mine", "train": ["view z.png", "view s.png"], "test": ["view y.png", "gone.png"]}"#;
-    std::fs::write(&path, json).unwrap();
-    let capture = load(root.path()).unwrap();
-    let names = |indices: &[usize]| -> Vec<String> {
-        let name = |&i: &usize| capture.views[i].name.clone();
-        indices.iter().map(name).collect()
-    };
-    assert_eq!(names(&capture.split.train), ["view s.png", "view z.png"]);
-    assert_eq!(names(&capture.split.test), ["view y.png"]);
-    assert_eq!(
-        capture.warnings,
-        [
-            CaptureWarning::SplitNamesUnknown {
-                count: 1,
-                first: "gone.png".into()
-            },
-            CaptureWarning::SplitLeavesOut {
-                count: 6,
-                first: "view r.png".into()
-            },
-        ]
-    );
-
-    std::fs::write(
-        &path,
-        r#"{"train": ["view z.png"], "test": ["view z.png"]}"#,
-    )
-    .unwrap();
-    assert!(
-        error_of(root.path(), "split.json")
-            .to_string()
-            .contains("view z.png")
-    );
-    std::fs::write(&path, "[]").unwrap();
-    error_of(root.path(), "split.json");
-
-    // As saved by editors on Windows.
-    let marked = format!("\u{feff}{}", json.replace(", ", ",\r\n"));
-    std::fs::write(&path, marked).unwrap();
-    assert_eq!(load(root.path()).unwrap().split, capture.split);
-    let utf16: Vec<u8> = json.encode_utf16().flat_map(u16::to_le_bytes).collect();
-    std::fs::write(&path, utf16).unwrap();
-    assert!(
-        error_of(root.path(), "split.json")
-            .to_string()
-            .contains("UTF-16")
-    );
-}
-
-#[test]
 fn downscale_averages_areas_and_divides_intrinsics() {
     let (root, _) = good();
     let full = load(root.path()).unwrap();
@@ -245,8 +193,14 @@ fn downscale_averages_areas_and_divides_intrinsics() {
 
     // Pixels that do not fill a block are dropped: 7 x 5 by 3 is 2 x 1.
     let image: Vec<u8> = (0..7 * 5).flat_map(|i| [i, 0, 255]).collect();
-    let (pixels, w, h) = downscale::area_average(&image, 7, 5, 3);
-    assert_eq!((w, h), (2, 1));
+    let picture = downscale::Picture {
+        pixels: &image,
+        mask: None,
+        width: 7,
+        height: 5,
+    };
+    let (pixels, mask) = downscale::area_average(&picture, 3);
+    assert_eq!(mask, None);
     assert_eq!(pixels, [8, 0, 255, 11, 0, 255]);
 
     let none = CaptureSettings {
@@ -292,14 +246,17 @@ fn rescaled_photos_take_their_intrinsics_along() {
 }
 
 #[test]
-fn transparent_pixels_are_put_on_black() {
+fn transparent_pixels_are_masked_and_keep_their_colour() {
     let (root, _) = good();
     let pixel = |x: u32, _| image::Rgba([200, 100, 50, if x == 0 { 128 } else { 255 }]);
     image::RgbaImage::from_fn(32, 24, pixel)
         .save(root.path().join("images/view r.png"))
         .unwrap();
     let capture = load(root.path()).unwrap();
-    assert_eq!(capture.views[0].image[..6], [100, 50, 25, 200, 100, 50]);
+    let view = &capture.views[0];
+    assert_eq!(view.image[..6], [200, 100, 50, 200, 100, 50]);
+    assert_eq!(view.mask.as_ref().unwrap()[..3], [128, 255, 255]);
+    assert_eq!(capture.views[1].mask, None);
     let [CaptureWarning::TransparentPhotos { count: 1, .. }] = capture.warnings[..] else {
         panic!("a warning, not {:?}", capture.warnings);
     };
@@ -433,7 +390,12 @@ fn garbage_is_an_error() {
 #[test]
 fn other_camera_models_are_named() {
     let (root, mut model) = good();
-    for (number, name) in [(4, "OPENCV"), (2, "SIMPLE_RADIAL"), (99, "number 99")] {
+    for (number, name) in [
+        (7, "FOV (number 7)"),
+        (10, "THIN_PRISM_FISHEYE (number 10)"),
+        (17, "EQUIRECTANGULAR (number 17)"),
+        (99, "number 99"),
+    ] {
         model.cameras[1].1 = number;
         model.write_binary(&root.path().join("sparse/0"));
         let error = error_of(root.path(), "cameras.bin");
@@ -441,13 +403,189 @@ fn other_camera_models_are_named() {
             &error,
             CaptureError::UnsupportedCamera { camera_id: 2, model, .. } if model == name
         ));
-        assert!(error.to_string().contains(name));
+        let help = if number == 17 {
+            "perspective views"
+        } else {
+            "image_undistorter"
+        };
+        let message = error.to_string();
+        assert!(
+            message.contains(name) && message.contains(help),
+            "{message}"
+        );
     }
-    model.cameras[1].1 = 4;
+    model.cameras[1].1 = 7;
     std::fs::remove_dir_all(root.path().join("sparse")).unwrap();
     model.write_text(&root.path().join("sparse/0"));
     let message = error_of(root.path(), "cameras.txt").to_string();
-    assert!(message.contains("camera 2") && message.contains("OPENCV"));
+    assert!(message.contains("camera 2") && message.contains("FOV"));
+}
+
+/// Every model that is read, in both encodings.
+#[test]
+fn lenses_are_read() {
+    let opencv = |k: [f64; 4]| Lens::OpenCv([k[0], k[1], k[2], k[3], 0.0, 0.0, 0.0, 0.0]);
+    let cases = [
+        (
+            2,
+            vec![33.0, 12.0, 15.0, -0.1],
+            opencv([-0.1, 0.0, 0.0, 0.0]),
+        ),
+        (2, vec![33.0, 12.0, 15.0, 0.0], Lens::Pinhole),
+        (
+            3,
+            vec![33.0, 12.0, 15.0, -0.1, 0.01],
+            opencv([-0.1, 0.01, 0.0, 0.0]),
+        ),
+        (
+            4,
+            vec![33.0, 34.0, 12.0, 15.0, -0.1, 0.01, 1e-3, 2e-3],
+            opencv([-0.1, 0.01, 1e-3, 2e-3]),
+        ),
+        (
+            5,
+            vec![33.0, 34.0, 12.0, 15.0, -0.1, 0.01, 1e-3, 2e-3],
+            Lens::OpenCvFisheye([-0.1, 0.01, 1e-3, 2e-3]),
+        ),
+        (
+            6,
+            vec![
+                33.0, 34.0, 12.0, 15.0, 0.1, 0.2, 1e-3, 2e-3, 0.3, 0.4, 0.5, 0.6,
+            ],
+            Lens::OpenCv([0.1, 0.2, 1e-3, 2e-3, 0.3, 0.4, 0.5, 0.6]),
+        ),
+        (
+            8,
+            vec![33.0, 12.0, 15.0, 0.1],
+            Lens::OpenCvFisheye([0.1, 0.0, 0.0, 0.0]),
+        ),
+        (
+            9,
+            vec![33.0, 12.0, 15.0, 0.1, 0.2],
+            Lens::OpenCvFisheye([0.1, 0.2, 0.0, 0.0]),
+        ),
+        (14, vec![33.0, 12.0, 15.0], Lens::OpenCvFisheye([0.0; 4])),
+        (
+            15,
+            vec![33.0, 34.0, 12.0, 15.0],
+            Lens::OpenCvFisheye([0.0; 4]),
+        ),
+    ];
+    for (number, parameters, lens) in cases {
+        let (root, mut model) = good();
+        model.cameras[1].1 = number;
+        model.cameras[1].4 = parameters.clone();
+        let fy = parameters[usize::from([4, 5, 6, 15].contains(&number))];
+        for text in [false, true] {
+            let folder = root.path().join("sparse/0");
+            std::fs::remove_dir_all(&folder).unwrap();
+            if text {
+                model.write_text(&folder);
+            } else {
+                model.write_binary(&folder);
+            }
+            let capture = load(root.path()).unwrap();
+            let odd = |view: &&View| view.width == SIZES[1][0];
+            let view = capture.views.iter().find(odd).unwrap();
+            assert_eq!(view.lens, lens);
+            assert_eq!(view.camera().lens, lens);
+            assert_eq!(view.intrinsics, [33.0, fy, 12.0, 15.0]);
+            let other = capture.views.iter().find(|view| !odd(view)).unwrap();
+            assert_eq!(other.lens, Lens::Pinhole);
+            assert_eq!(capture.warnings, []);
+        }
+    }
+    let message = message_after("cameras.bin", |model| {
+        model.cameras[0].1 = 4;
+        model.cameras[0].4.extend([0.0, 0.0, f64::NAN, 0.0]);
+    });
+    assert!(
+        message.contains("camera 7: its distortion coefficient p1 is NaN"),
+        "{message}"
+    );
+}
+
+/// A lens that folds back at a radius of 0.58, where a pixel of the photo would be at 0.77 of the
+/// focal length.
+#[test]
+fn a_lens_that_ends_inside_of_the_photo_is_named() {
+    let (root, mut model) = good();
+    model.cameras[1].1 = 2;
+    model.cameras[1].4 = vec![25.0, 12.0, 15.0, -1.0];
+    model.write_binary(&root.path().join("sparse/0"));
+    let capture = load(root.path()).unwrap();
+    let [
+        CaptureWarning::LensFoldsBack {
+            count: 1,
+            camera: 2,
+            share,
+        },
+    ] = capture.warnings[..]
+    else {
+        panic!("a warning, not {:?}", capture.warnings);
+    };
+    // The lens reaches 0.385 focal lengths, or 9.6 pixels: a disk of 290 in 24 x 30.
+    assert!((share - (1.0 - 290.0 / 720.0)).abs() < 0.05, "{share}");
+    let message = capture.warnings[0].to_string();
+    assert!(
+        message.contains("camera 2") && message.contains("border"),
+        "{message}"
+    );
+}
+
+/// COLMAP writes every part of a reconstruction to a folder of its own.
+#[test]
+fn the_model_with_the_most_images_is_read() {
+    for text in [false, true] {
+        let (root, mut model) = good();
+        let sparse = root.path().join("sparse");
+        let write = |model: &TestCapture, name: &str| {
+            if text {
+                model.write_text(&sparse.join(name));
+            } else {
+                model.write_binary(&sparse.join(name));
+            }
+        };
+        std::fs::remove_dir_all(sparse.join("0")).unwrap();
+        write(&model, "10");
+        model.images.truncate(3);
+        write(&model, "0");
+        model.images.truncate(2);
+        write(&model, "2");
+        let capture = load(root.path()).unwrap();
+        assert_eq!(capture.views.len(), 9);
+        let expected = CaptureWarning::OtherModels {
+            used: sparse.join("10"),
+            images: 9,
+            others: 2,
+        };
+        assert_eq!(capture.warnings[..1], [expected]);
+        let message = capture.warnings[0].to_string();
+        assert!(message.contains("(9) of 3"), "{message}");
+
+        // An impossible count is no reason.
+        std::fs::remove_dir_all(sparse.join("2")).unwrap();
+        model.write_binary(&sparse.join("2"));
+        std::fs::write(sparse.join("2/images.bin"), [0xff; 80]).unwrap();
+        assert_eq!(load(root.path()).unwrap().views.len(), 9);
+    }
+}
+
+#[test]
+fn a_capture_without_points_gets_random_ones() {
+    let (root, mut model) = good();
+    model.points.clear();
+    model.write_binary(&root.path().join("sparse/0"));
+    let empty = load(root.path()).unwrap();
+    assert_eq!(empty.points.len(), 100_000);
+    let [CaptureWarning::RandomPoints { count: 100_000, .. }] = empty.warnings[..] else {
+        panic!("a warning, not {:?}", empty.warnings);
+    };
+    std::fs::remove_file(root.path().join("sparse/0/points3D.bin")).unwrap();
+    let missing = load(root.path()).unwrap();
+    assert_eq!(missing.points, empty.points);
+    assert_eq!(missing.warnings, empty.warnings);
+    assert_eq!(missing.background, None);
 }
 
 /// Breaks one thing in the valid model and returns the error message, which must name `file`.
@@ -461,11 +599,10 @@ fn message_after(file: &str, spoil: impl FnOnce(&mut TestCapture)) -> String {
 #[test]
 fn nonsense_in_a_record_is_named() {
     type Case = (&'static str, &'static str, fn(&mut TestCapture));
-    let cases: [Case; 13] = [
+    let cases: [Case; 12] = [
         ("points3D.bin", "point 3", |m| {
             m.points[3].1.position[1] = f64::INFINITY;
         }),
-        ("points3D.bin", "no point", |m| m.points.clear()),
         ("images.bin", "no image", |m| m.images.clear()),
         ("images.bin", "image 98", |m| m.images[2].2[0] = f64::NAN),
         ("images.bin", "image 98", |m| m.images[2].1[3] = f64::NAN),
@@ -501,7 +638,6 @@ fn bad_text_names_the_line() {
         ("images.txt", "1 1 0 0 0 0 0 x 7 a.png\n\n", "line 1"),
         ("images.txt", "1 1 0 0 0 0 0 0 7 \n\n", "name"),
         ("points3D.txt", "1 0 0 0 1 2 300 0.5\n", "colour"),
-        ("points3D.txt", "# nothing\n", "no point"),
     ];
     for (file, text, word) in cases {
         model.write_text(&folder);
@@ -530,14 +666,12 @@ fn missing_files_are_named() {
     let folder = root.path().to_string_lossy().into_owned();
     assert!(matches!(
         error_of(root.path(), &folder),
-        CaptureError::NoModel { hint: "", .. }
+        CaptureError::NoModel { .. }
     ));
-    std::fs::write(root.path().join("transforms.json"), b"{}").unwrap();
-    error_of(root.path(), "nerfstudio");
-
-    let file = root.path().join("transforms.json");
+    let file = root.path().join("transforms.txt");
+    std::fs::write(&file, b"{}").unwrap();
     assert!(matches!(
-        error_of(&file, "transforms.json"),
+        error_of(&file, "transforms.txt"),
         CaptureError::NotAFolder { .. }
     ));
     let absent = root.path().join("absent");

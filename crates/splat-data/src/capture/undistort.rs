@@ -114,6 +114,7 @@ mod tests {
             lens,
             image: Arc::new(image.collect()),
             mask: None,
+            depth: None,
         }
     }
 

@@ -20,11 +20,13 @@
 mod columns;
 mod comments;
 mod header;
+mod points;
 mod repetition;
+mod rows;
 
 use std::cell::Cell;
 use std::fs::File;
-use std::io::{BufRead, BufReader, BufWriter, ErrorKind, Write};
+use std::io::{BufRead, BufReader, BufWriter, Write};
 use std::path::Path;
 
 use ply_rs_bw::parser::Parser;
@@ -36,6 +38,8 @@ use ply_rs_bw::writer::Writer;
 
 use super::{SceneFileError, SceneFormat, SplatData};
 use columns::{Columns, may_be};
+pub(crate) use points::parse_points;
+use rows::{FileRow, Rows};
 
 /// PLY files with splats.
 pub(super) const FORMAT: SceneFormat = SceneFormat {
@@ -149,16 +153,10 @@ fn read_from(
     bytes: u64,
 ) -> Result<SplatData, SceneFileError> {
     let parser = Parser::<Row>::new();
-    let header = header::read(&mut reader, &parser, path)?;
+    let header = header::read(&mut reader, path)?;
     let columns = Columns::find(path, &header)?;
     for element in header.elements.values() {
-        let mut rows = Rows {
-            path,
-            parser: &parser,
-            encoding: header.encoding,
-            element,
-            line: String::new(),
-        };
+        let mut rows = Rows::new(path, &parser, header.encoding, element);
         if element.properties.is_empty() {
             continue; // whatever its count, nothing of it is in the file
         }
@@ -260,118 +258,16 @@ impl PropertyAccess for Row {
     }
 }
 
-/// Reads the elements of one kind, one by one.
-struct Rows<'a> {
-    path: &'a Path,
-    parser: &'a Parser<Row>,
-    encoding: Encoding,
-    element: &'a ElementDef,
-    line: String,
-}
-
-impl Rows<'_> {
-    /// Skips all of them.
-    fn skip(&mut self, reader: &mut impl BufRead) -> Result<(), SceneFileError> {
-        // A binary file stores nothing for an element without properties, whatever count the header
-        // announces.
-        let nothing = self.element.properties.is_empty() && self.encoding != Encoding::Ascii;
-        for index in 0..if nothing { 0 } else { self.element.count } {
-            self.next(reader, index)?;
-        }
-        Ok(())
+impl FileRow for Row {
+    fn push_word(&mut self, word: &str) -> bool {
+        let value = word.parse();
+        self.values.extend(&value);
+        value.is_ok()
     }
 
-    fn next(&mut self, reader: &mut impl BufRead, index: usize) -> Result<Row, SceneFileError> {
-        let row = match self.encoding {
-            Encoding::Ascii => return self.next_line(reader, index),
-            Encoding::BinaryLittleEndian => {
-                self.parser.read_little_endian_element(reader, self.element)
-            }
-            Encoding::BinaryBigEndian => self.parser.read_big_endian_element(reader, self.element),
-        };
-        row.map_err(|error| match error.kind() {
-            ErrorKind::UnexpectedEof => self.truncated(index),
-            _ => self.bad(index, &error.to_string()),
-        })
+    fn push_list(&mut self) {
+        self.values.push(f32::NAN);
     }
-
-    fn next_line(
-        &mut self,
-        reader: &mut impl BufRead,
-        index: usize,
-    ) -> Result<Row, SceneFileError> {
-        loop {
-            self.line.clear();
-            match reader.read_line(&mut self.line) {
-                Ok(0) => return Err(self.truncated(index)),
-                Ok(_) if self.line.trim().is_empty() => {}
-                Ok(_) => break,
-                Err(error) => return Err(self.bad(index, &error.to_string())),
-            }
-        }
-        self.parse_line()
-            .map_err(|(property, reason)| self.bad(index, &format!("{property} {reason}")))
-    }
-
-    /// The values of the line, or a property and its problem. The library's own line grammar has no
-    /// NaN or infinity, and errors should name the property.
-    fn parse_line(&self) -> Result<Row, (&str, String)> {
-        let mut words = self.line.split_whitespace();
-        let mut row = Row::new();
-        for (name, property) in &self.element.properties {
-            let mut word = || words.next().ok_or((name.as_str(), "is missing".to_owned()));
-            let unreadable = |word: &str| (name.as_str(), format!("`{word}` is no number"));
-            match property.data_type {
-                PropertyType::Scalar(_) => {
-                    let word = word()?;
-                    let value = word.parse().map_err(|_| unreadable(word))?;
-                    row.values.push(value);
-                }
-                PropertyType::List(..) => {
-                    let length = word()?;
-                    let length: usize = length.parse().map_err(|_| unreadable(length))?;
-                    for _ in 0..length {
-                        word()?;
-                    }
-                    row.values.push(f32::NAN);
-                }
-            }
-        }
-        match (words.next(), self.element.properties.last()) {
-            (Some(word), Some((name, _))) => Err((
-                name,
-                format!("is followed by `{word}`, of which the header knows nothing"),
-            )),
-            _ => Ok(row),
-        }
-    }
-
-    /// Name of the property in column `column`.
-    fn property(&self, column: usize) -> String {
-        let name = self.element.properties.get_index(column);
-        name.map_or_else(String::new, |(name, _)| name.clone())
-    }
-
-    fn truncated(&self, index: usize) -> SceneFileError {
-        SceneFileError::Truncated {
-            path: self.path.to_path_buf(),
-            index,
-            count: self.element.count,
-        }
-    }
-
-    fn bad(&self, index: usize, reason: &str) -> SceneFileError {
-        SceneFileError::BadElement {
-            path: self.path.to_path_buf(),
-            index,
-            reason: one_line(reason),
-        }
-    }
-}
-
-/// The library's messages span several lines; ours do not.
-fn one_line(message: &str) -> String {
-    message.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 /// The error without the random name of the temporary file, which means nothing to the user.

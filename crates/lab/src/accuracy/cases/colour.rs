@@ -103,6 +103,7 @@ fn large_and_eight_bit(device: &Device) -> Result<Outcome, AccuracyError> {
         lens: splat_data::Lens::Pinhole,
         image: Arc::new((0..=255).flat_map(|level| [level; 3]).collect()),
         mask: None,
+        depth: None,
     };
     let photo = splat_trainer::photo(&view, device)
         .try_into_vec_as::<f64>()

@@ -146,6 +146,7 @@ fn view(index: usize, width: u32, height: u32) -> View {
         lens: Lens::Pinhole,
         image: Arc::new(image),
         mask: None,
+        depth: None,
     }
 }
 

@@ -28,7 +28,7 @@ fn file(after: impl Fn(usize) -> &'static str) -> String {
     head.to_owned() + &lines.collect::<String>()
 }
 
-fn images(text: impl AsRef<[u8]>) -> Vec<SparseImage> {
+fn images(text: impl AsRef<[u8]>) -> Vec<ColmapImage> {
     parse_images(PATH.as_ref(), text.as_ref()).unwrap().records
 }
 

@@ -11,8 +11,9 @@ use ply_rs_bw::parser::{Parser, Reader};
 use ply_rs_bw::ply::Header;
 
 use super::super::SceneFileError;
+use super::Row;
 use super::repetition::repetition;
-use super::{Row, one_line};
+use crate::text::one_line;
 
 /// Longest accepted header in bytes; anything longer is not a PLY header.
 const LONGEST: u64 = 1 << 20;
@@ -20,11 +21,7 @@ const LONGEST: u64 = 1 << 20;
 const BYTE_ORDER_MARK: &[u8] = b"\xEF\xBB\xBF";
 
 /// Reads the header, leaving `reader` after it.
-pub(super) fn read(
-    reader: &mut impl BufRead,
-    parser: &Parser<Row>,
-    path: &Path,
-) -> Result<Header, SceneFileError> {
+pub(super) fn read(reader: &mut impl BufRead, path: &Path) -> Result<Header, SceneFileError> {
     let bad = |reason: String| SceneFileError::Header {
         path: path.to_path_buf(),
         reason: format!("no PLY header: {reason}"),
@@ -74,7 +71,7 @@ pub(super) fn read(
             reason: format!("`{line}` repeats a name of the header"),
         });
     }
-    let header = parser.read_header(&mut Reader::new(text.as_bytes()));
+    let header = Parser::<Row>::new().read_header(&mut Reader::new(text.as_bytes()));
     header.map_err(|error| {
         let message = error.to_string();
         // The rest is about the grammar, not about the file.
