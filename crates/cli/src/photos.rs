@@ -1,12 +1,15 @@
 //! Options for reading photos, shared by all commands that read a capture.
 
 use std::ffi::OsString;
+use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
 
 use clap::Args;
 
 use super::{Failure, GlobalArgs};
-use splat_data::{Capture, CaptureSettings};
+use crate::report::progress::Progress;
+use splat_data::{Capture, CaptureError, CaptureSettings, SplitRule};
 
 /// Options of commands that read a capture.
 #[derive(Debug, Clone, Default, Args)]
@@ -17,6 +20,49 @@ pub struct PhotoArgs {
     /// Folder of the photos, relative to the capture or absolute [default: images]
     #[arg(long, value_name = "DIR")]
     pub images: Option<PathBuf>,
+    /// Views to hold out of training: every K-th by name (0: none), names separated by commas, or a
+    /// file that names them [default: those that the capture says, or every 8th]
+    #[arg(long, value_name = "K|NAMES|FILE")]
+    pub hold_out: Option<String>,
+}
+
+/// The rule that a value of `--hold-out` is.
+fn hold_out(value: &str) -> SplitRule {
+    if let Ok(interval) = value.parse() {
+        return SplitRule::Every(interval);
+    }
+    let path = Path::new(value);
+    if path.is_file() {
+        return SplitRule::File(path.to_path_buf());
+    }
+    SplitRule::Names(
+        value
+            .split(',')
+            .map(|name| name.trim().to_owned())
+            .collect(),
+    )
+}
+
+/// Reads a capture, with a bar on a terminal.
+pub(super) fn load(
+    folder: &Path,
+    settings: &CaptureSettings,
+    global: &GlobalArgs,
+) -> Result<Capture, CaptureError> {
+    if global.quiet || !std::io::stderr().is_terminal() {
+        return Capture::load(folder, settings);
+    }
+    let bar: Mutex<Option<Progress>> = Mutex::new(None);
+    let lock = || bar.lock().unwrap_or_else(PoisonError::into_inner);
+    let capture = Capture::load_with_progress(folder, settings, &|done, total| {
+        let mut bar = lock();
+        let bar = bar.get_or_insert_with(|| Progress::new(total as u64, 0, false));
+        bar.update(done as u64, || "photos".to_owned());
+    });
+    if let Some(bar) = lock().as_mut() {
+        bar.finish();
+    }
+    capture
 }
 
 impl PhotoArgs {
@@ -26,12 +72,13 @@ impl PhotoArgs {
         CaptureSettings {
             downscale: self.downscale.unwrap_or(default.downscale),
             images: self.images.clone(),
+            split: self.hold_out.as_deref().map_or(default.split, hold_out),
         }
     }
 
     /// Reads a capture and prints its warnings.
     pub(super) fn open(&self, folder: &Path, global: &GlobalArgs) -> Result<Capture, Failure> {
-        let capture = Capture::load(folder, &self.options())?;
+        let capture = load(folder, &self.options(), global)?;
         for warning in &capture.warnings {
             global.say(format_args!("warning: {warning}"));
         }
@@ -46,6 +93,9 @@ impl PhotoArgs {
         }
         if let Some(images) = &self.images {
             words.extend(["--images".into(), images.into()]);
+        }
+        if let Some(rule) = &self.hold_out {
+            words.extend(["--hold-out".into(), rule.into()]);
         }
         words
     }
@@ -80,6 +130,8 @@ mod tests {
             &["--images", "my photos", "--downscale", "3"][..],
             &["--images", "/data/photos"],
             &["--downscale", "2"],
+            &["--hold-out", "0"],
+            &["--hold-out", "a.jpg,b/c.jpg"],
             &[],
         ] {
             let parse = |words: &[OsString]| {

@@ -11,7 +11,7 @@ use clap::{Args, ValueEnum};
 
 use super::command_line::CommandLine;
 use super::device::ChosenDevice;
-use super::photos::PhotoArgs;
+use super::photos::{self, PhotoArgs};
 use super::{Failure, GlobalArgs, device, eval, interrupt, print, text};
 use crate::report::progress::Progress;
 use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
@@ -162,12 +162,15 @@ impl TrainArgs {
         given.unwrap_or_else(|| Path::new("out").join(&capture.name))
     }
 
-    /// Adds the folder of the photos, which is no setting of the run, to a command.
-    fn images(&self, line: CommandLine) -> CommandLine {
-        match &self.photos.images {
-            Some(folder) => line.option("--images", folder),
-            None => line,
+    /// Adds what is read of the capture, which is no setting of the run, to a command.
+    fn images(&self, mut line: CommandLine) -> CommandLine {
+        if let Some(folder) = &self.photos.images {
+            line = line.option("--images", folder);
         }
+        if let Some(rule) = &self.photos.hold_out {
+            line = line.option("--hold-out", rule.as_ref());
+        }
+        line
     }
 
     /// The command that resumes the run in `out`. Its settings are in the checkpoint.
@@ -192,7 +195,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         downscale: config.downscale,
         ..args.photos.options()
     };
-    let capture = Capture::load(&args.capture, &options)?;
+    let capture = photos::load(&args.capture, &options, global)?;
     capture.check_trainable()?;
     for warning in &capture.warnings {
         global.say(format_args!("warning: {warning}"));

@@ -212,6 +212,8 @@ impl<M: SplatModel> TrainerBuilder<M> {
             changes: Vec::new(),
         };
         let mut config = self.config;
+        // What transparent photos were composited on is behind the scene.
+        config.background = config.background.or(self.capture.background);
         if config.max_gaussians().is_none() {
             config.set_max_gaussians(default_max_gaussians(&self.capture));
         }

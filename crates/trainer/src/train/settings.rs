@@ -49,7 +49,8 @@ pub struct TrainSettings {
     pub sh_degree_every: usize,
     /// Multiply opacities by what the low-pass filter took away. Default false.
     pub antialias: bool,
-    /// Colour behind the scene, linear RGB; black when absent.
+    /// Colour behind the scene, linear RGB. When absent that of the capture, such as the white of
+    /// Blender's; else black.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub background: Option<[f32; 3]>,
     /// Weight of 1 - SSIM against L1 in the default loss. Default 0.2.
