@@ -107,6 +107,16 @@ impl Coefficients {
     }
 }
 
+/// One value, or zero if there are none.
+#[cube]
+fn value(values: &ComptimeOption<&[f32]>, at: usize) -> f32 {
+    let mut value = 0.0f32;
+    if let ComptimeOption::Some(values) = values {
+        value = values[at];
+    }
+    value
+}
+
 #[cube]
 impl Lens {
     fn load(
@@ -116,25 +126,22 @@ impl Lens {
         #[comptime] model: CameraModel,
     ) -> Lens {
         let mut k = Coefficients::zero();
-        if let ComptimeOption::Some(distortion) = distortion {
-            let at = index * comptime!(model.coefficients());
-            k.c0 = distortion[at];
-            k.c1 = distortion[at + 1];
-            k.c2 = distortion[at + 2];
-            k.c3 = distortion[at + 3];
-            if comptime!(model.coefficients() > 4) {
-                k.c4 = distortion[at + 4];
-                k.c5 = distortion[at + 5];
-                k.c6 = distortion[at + 6];
-                k.c7 = distortion[at + 7];
-            }
+        let width = comptime!(model.coefficients());
+        let at = index * width;
+        if comptime!(width > 0) {
+            k.c0 = value(distortion, at);
+            k.c1 = value(distortion, at + 1);
+            k.c2 = value(distortion, at + 2);
+            k.c3 = value(distortion, at + 3);
         }
-        let mut limit = 0.0f32;
-        let mut clamp = 0.0f32;
-        if let ComptimeOption::Some(domain) = domain {
-            limit = domain[index * 2];
-            clamp = domain[index * 2 + 1];
+        if comptime!(width > 4) {
+            k.c4 = value(distortion, at + 4);
+            k.c5 = value(distortion, at + 5);
+            k.c6 = value(distortion, at + 6);
+            k.c7 = value(distortion, at + 7);
         }
+        let limit = value(domain, index * 2);
+        let clamp = value(domain, index * 2 + 1);
         Lens { k, limit, clamp }
     }
 }
