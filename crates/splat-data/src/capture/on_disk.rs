@@ -9,9 +9,12 @@ use super::{CaptureError, View};
 
 /// A photo on the disk, with how it is to be read. See [`View::loaded`].
 #[derive(Debug, Clone)]
-pub struct PhotoOnDisk {
+pub struct PhotoOnDisk(Arc<Photo>);
+
+#[derive(Debug, Clone)]
+struct Photo {
     loader: Arc<Loader>,
-    image: Arc<SparseImage>,
+    image: SparseImage,
     camera: SparseCamera,
     /// Factors of [`View::downscaled`], in their order.
     factors: Vec<u32>,
@@ -26,31 +29,37 @@ impl PhotoOnDisk {
     ) -> Result<Loaded, CaptureError> {
         let path = loader.folder.join(&image.name);
         let mut loaded = loader.placed(image, camera, &path, size_or_error(&path)?)?;
-        loaded.view.on_disk = Some(Self {
+        loaded.view.on_disk = Some(Self(Arc::new(Photo {
             loader: loader.clone(),
-            image: Arc::new(image.clone()),
+            image: image.clone(),
             camera: *camera,
             factors: vec![],
-        });
+        })));
         Ok(loaded)
     }
 
     /// The same photo, downscaled.
     pub(super) fn downscaled(&self, factor: u32) -> Self {
-        let mut photo = self.clone();
+        let mut photo = Photo::clone(&self.0);
         photo.factors.push(factor);
-        photo
+        Self(Arc::new(photo))
     }
 
     /// Decodes the photo and its mask for a view.
     pub(super) fn load(&self, view: &View) -> Result<View, CaptureError> {
-        let mut read = self.loader.load(&self.image, &self.camera)?.view;
-        for factor in &self.factors {
+        let Photo {
+            loader,
+            image,
+            camera,
+            factors,
+        } = &*self.0;
+        let mut read = loader.load(image, camera)?.view;
+        for factor in factors {
             read = read.downscaled(*factor);
         }
         if [read.width, read.height] != [view.width, view.height] {
             return Err(CaptureError::UndecodablePhoto {
-                path: self.loader.folder.join(&self.image.name),
+                path: loader.folder.join(&image.name),
                 reason: "its size has changed since the capture was read".to_owned(),
             });
         }
