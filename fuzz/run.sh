@@ -3,8 +3,8 @@
 #
 #   fuzz/run.sh PARSER... SECONDS        fuzz/run.sh all 1800
 #
-# PARSER: colmap_binary, colmap_text, ply, fixture, checkpoint, config, gaussians, or all. Prints one line per parser; exit status 1 if any
-# input fails. The same seed (environment variable SEED) repeats a run of one build.
+# PARSER: colmap_binary, colmap_text, transforms, ply, points, fixture, checkpoint, config, gaussians, or all. Prints one line per
+# parser; exit status 1 if any input fails. The same seed (environment variable SEED) repeats a run of one build.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 if [ $# -lt 2 ]; then

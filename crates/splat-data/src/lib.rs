@@ -33,7 +33,8 @@ pub mod text;
 
 pub use camera::Camera;
 pub use capture::{
-    Capture, CaptureError, CaptureSettings, CaptureWarning, Point, Split, SplitRule, View,
+    Capture, CaptureError, CaptureSettings, CaptureWarning, PhotoOnDisk, Point, Split, SplitRule,
+    View,
 };
 pub use replace::{
     WriteError, probe_file, probe_files, probe_folder, write_atomically, write_durably,

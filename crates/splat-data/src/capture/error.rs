@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use splat_core::memory::in_units;
+
 use super::colmap_models;
 
 /// Why a capture cannot be used. Every message is one line that names the file and the record, and
@@ -196,22 +198,18 @@ pub enum CaptureError {
         /// The decoder's message.
         reason: String,
     },
-    /// The photos together need more memory than is available.
+    /// A photo alone needs more memory than is available.
     #[error(
-        "{}: {photos} photos need {:.1} GB of memory, and {:.1} GB are left; read them smaller (--downscale, now {downscale})",
-        root.display(), *needed as f64 / 1e9, *left as f64 / 1e9
+        "{}: a photo needs {} of memory, and {} are left; rescale the photos to a smaller size",
+        root.display(), in_units(*needed), in_units(*left)
     )]
     OutOfMemory {
         /// The capture's folder.
         root: PathBuf,
-        /// Number of photos.
-        photos: usize,
-        /// Bytes of their pixels.
+        /// Bytes of the pixels of the largest photo, before it is downscaled.
         needed: u64,
         /// Bytes that this process can still allocate.
         left: u64,
-        /// The requested downscale factor.
-        downscale: u32,
     },
     /// A photo whose aspect ratio differs from its camera's.
     #[error(

@@ -94,5 +94,6 @@ fn view(model: &SparseModel, image: &SparseImage) -> View {
         image: Arc::default(),
         mask: None,
         depth: None,
+        on_disk: None,
     }
 }

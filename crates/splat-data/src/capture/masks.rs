@@ -11,6 +11,7 @@ use super::sparse_model::SparseImage;
 use super::{CaptureError, CaptureWarning};
 
 /// Files with masks.
+#[derive(Debug)]
 pub(super) struct Masks {
     folder: Option<PathBuf>,
 }
@@ -37,6 +38,11 @@ impl Masks {
         let appended = folder.join(format!("{}.png", image.name));
         let replaced = folder.join(&image.name).with_extension("png");
         [appended, replaced].into_iter().find(|path| path.is_file())
+    }
+
+    /// True if any of the images may have a mask file.
+    pub fn any(&self, images: &[SparseImage]) -> bool {
+        self.folder.is_some() || images.iter().any(|image| image.mask.is_some())
     }
 
     /// Photos without a mask although there is a folder of masks.

@@ -27,7 +27,10 @@ pub mod in_memory;
 mod jpeg;
 mod lens_checks;
 mod masks;
+mod on_disk;
 mod photo_file;
+mod photo_loader;
+mod photo_memory;
 mod points_file;
 mod random_points;
 mod save;
@@ -38,6 +41,7 @@ mod undistort;
 mod warning;
 
 use derive_setters::Setters;
+use std::borrow::Cow;
 use std::collections::HashMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -49,6 +53,7 @@ use crate::Camera;
 use random_points::Room;
 
 pub use error::CaptureError;
+pub use on_disk::PhotoOnDisk;
 pub use split::{Split, SplitRule};
 pub use warning::CaptureWarning;
 
@@ -97,12 +102,15 @@ pub struct View {
     /// Camera model and distortion.
     pub lens: Lens,
     /// 8-bit RGB, row by row from the top: `3 * width * height` bytes. Shared, so that a view is
-    /// cheap to clone.
+    /// cheap to clone. Empty if the photo is [`on_disk`](Self::on_disk): see [`View::loaded`].
     pub image: Arc<Vec<u8>>,
-    /// Which pixels count, `width * height` bytes from 0 (ignored) to 255; `None` if all do.
+    /// Which pixels count, `width * height` bytes from 0 (ignored) to 255; `None` if all do, or if
+    /// the photo is [`on_disk`](Self::on_disk).
     pub mask: Option<Arc<Vec<u8>>>,
     /// The depth map that the capture names, if any. It exists, and is not read here.
     pub depth: Option<PathBuf>,
+    /// The photo, if it is not in memory ([`CaptureSettings::memory`]).
+    pub on_disk: Option<PhotoOnDisk>,
 }
 
 /// A point of structure from motion.
@@ -125,6 +133,10 @@ pub struct CaptureSettings {
     pub images: Option<PathBuf>,
     /// Which views are held out of training. Default: those that the capture says.
     pub split: SplitRule,
+    /// Most bytes of memory for the pixels of all photos. If they need more, every photo stays on
+    /// the disk, with a warning, and is decoded by [`View::loaded`]. Default: half of the memory
+    /// that is available, and no bound on systems other than Linux, which do not report it.
+    pub memory: Option<u64>,
 }
 
 impl CaptureSettings {
@@ -140,6 +152,7 @@ impl Default for CaptureSettings {
             downscale: 1,
             images: None,
             split: SplitRule::default(),
+            memory: None,
         }
     }
 }
@@ -163,7 +176,9 @@ impl Capture {
     ///
     /// Reading a COLMAP model takes less than 32 times the memory of its files, a `transforms.json`
     /// 128 times, and a JPEG file 64 times, while it is read. The pixels of the photos take three
-    /// bytes each in addition, or four with masks, and up to twelve while a photo is decoded.
+    /// bytes each in addition, or four with masks, and up to twelve while a photo is decoded. If
+    /// that is more than [`CaptureSettings::memory`], photos stay on the disk, and are only checked
+    /// when they are decoded.
     ///
     /// ```
     /// use splat_data::{Capture, CaptureSettings};
@@ -352,6 +367,21 @@ impl View {
         if factor <= 1 {
             return self.clone();
         }
+        let smaller = |image, mask| Self {
+            name: self.name.clone(),
+            width: self.width / factor,
+            height: self.height / factor,
+            intrinsics: downscale::intrinsics(self.intrinsics, factor),
+            viewmat: self.viewmat,
+            lens: self.lens,
+            image,
+            mask,
+            depth: self.depth.clone(),
+            on_disk: self.on_disk.as_ref().map(|photo| photo.downscaled(factor)),
+        };
+        if self.on_disk.is_some() {
+            return smaller(Arc::default(), None);
+        }
         let whole = downscale::Picture {
             pixels: &self.image,
             mask: self.mask.as_ref().map(|mask| mask.as_slice()),
@@ -359,17 +389,34 @@ impl View {
             height: self.height,
         };
         let (image, mask) = downscale::area_average(&whole, factor);
-        Self {
-            name: self.name.clone(),
-            width: self.width / factor,
-            height: self.height / factor,
-            intrinsics: downscale::intrinsics(self.intrinsics, factor),
-            viewmat: self.viewmat,
-            lens: self.lens,
-            image: Arc::new(image),
-            mask: mask.map(Arc::new),
-            depth: self.depth.clone(),
-        }
+        smaller(Arc::new(image), mask.map(Arc::new))
+    }
+
+    /// The view with its pixels in memory: the view itself, or with its photo and mask decoded from
+    /// the disk. Camera and pose are those of this view.
+    ///
+    /// ```
+    /// use splat_data::{Capture, CaptureSettings};
+    ///
+    /// # let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
+    /// // Bytes for all photos, which is not enough.
+    /// let options = CaptureSettings::new().with_downscale(16).with_memory(1_000);
+    /// let capture = Capture::load(folder, &options)?;
+    /// let view = &capture.views[0];
+    /// assert!(view.on_disk.is_some() && view.image.is_empty());
+    /// let loaded = view.loaded()?;
+    /// assert_eq!(loaded.image.len(), 3 * (view.width * view.height) as usize);
+    /// # Ok::<(), splat_data::CaptureError>(())
+    /// ```
+    ///
+    /// # Errors
+    ///
+    /// [`CaptureError`] if the photo can no longer be read, or has another size than before.
+    pub fn loaded(&self) -> Result<Cow<'_, Self>, CaptureError> {
+        Ok(match &self.on_disk {
+            None => Cow::Borrowed(self),
+            Some(photo) => Cow::Owned(photo.load(self)?),
+        })
     }
 
     /// Position of a world point in the photo, `(x, y)` in pixels, and its
@@ -404,6 +451,8 @@ fn folder_name(root: &Path) -> String {
 
 #[cfg(test)]
 mod mask_tests;
+#[cfg(test)]
+mod on_disk_tests;
 #[cfg(test)]
 mod photo_tests;
 #[cfg(test)]

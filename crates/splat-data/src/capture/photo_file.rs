@@ -66,6 +66,25 @@ fn undecodable(path: &Path, error: &ImageError) -> CaptureError {
     }
 }
 
+/// Width and height of a photo, from the head of its file; `None` if it cannot be read.
+pub(super) fn size_of(path: &Path) -> Option<[u32; 2]> {
+    size_or_error(path).ok()
+}
+
+/// Width and height of a photo, from the head of its file.
+pub(super) fn size_or_error(path: &Path) -> Result<[u32; 2], CaptureError> {
+    let io_error = |source| CaptureError::Io {
+        path: path.to_path_buf(),
+        source,
+    };
+    // The contents tell the format, not the name.
+    let reader = ImageReader::open(path).map_err(io_error)?;
+    let reader = reader.with_guessed_format().map_err(io_error)?;
+    let size = reader.into_dimensions();
+    size.map(<[u32; 2]>::from)
+        .map_err(|error| undecodable(path, &error))
+}
+
 /// 8-bit RGB; and alpha, if any pixel is not opaque. Values of 16 bits are rounded to the nearest.
 pub(super) fn rgb_and_alpha(photo: DynamicImage) -> (Vec<u8>, Option<Vec<u8>>) {
     if !photo.color().has_alpha() {

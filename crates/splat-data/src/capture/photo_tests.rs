@@ -44,33 +44,6 @@ fn photo(format: ImageFormat) -> Vec<u8> {
     bytes.into_inner()
 }
 
-/// Measured by the photos' sizes if their cameras' are larger.
-#[test]
-fn photos_that_memory_cannot_hold_are_refused_before_they_are_read() {
-    let (root, _) = good();
-    let capture = load(root.path()).unwrap();
-    let bytes: u64 = capture.views.iter().map(|v| v.image.len() as u64).sum();
-    let (mut model, _) = colmap::read(root.path(), &CaptureSettings::new()).unwrap();
-    let check = |model: &sparse_model::SparseModel, factor: u32, left: Option<u64>| {
-        let folder = root.path().join("images");
-        images::check_memory(root.path(), &folder, model, factor, left)
-    };
-    for camera in model.cameras.values_mut() {
-        if let sparse_model::Intrinsics::Pixels { size, .. } = &mut camera.intrinsics {
-            *size = [u32::MAX; 2];
-        }
-    }
-    assert!(check(&model, 1, Some(bytes)).is_ok());
-    assert!(check(&model, 1, None).is_ok());
-    assert!(check(&model, 2, Some(bytes / 2)).is_ok());
-    let message = check(&model, 1, Some(bytes - 1)).unwrap_err().to_string();
-    let photos = format!("{} photos need", capture.views.len());
-    assert!(
-        message.contains(&photos) && message.contains("--downscale"),
-        "{message}"
-    );
-}
-
 #[test]
 fn a_part_of_a_photo_is_refused_by_name() {
     let (root, _) = good();

@@ -31,6 +31,7 @@ impl Capture {
             return Err(already_there(&model));
         }
         for view in &self.views {
+            let view = &*view.loaded()?;
             let name = Path::new("images").join(&view.name);
             write(
                 &root.join(&name),

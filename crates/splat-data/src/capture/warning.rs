@@ -3,6 +3,8 @@
 use std::fmt;
 use std::path::PathBuf;
 
+use splat_core::memory::in_units;
+
 /// A problem that did not prevent reading the capture. `Display` gives one line.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
@@ -43,6 +45,15 @@ pub enum CaptureWarning {
         photos: usize,
         /// The first of them.
         first: String,
+    },
+    /// Photos that would need too much memory; each is decoded whenever it is needed.
+    PhotosOnDisk {
+        /// Number of photos.
+        photos: usize,
+        /// Bytes that all would need.
+        needed: u64,
+        /// Bytes that they may take.
+        bound: u64,
     },
     /// A text file of the model lists more or fewer records than its comments announce.
     Miscounted {
@@ -175,6 +186,16 @@ impl fmt::Display for CaptureWarning {
                 "{count} of {photos} photo(s) have no mask in {}, from `{first}` (`{first}.png`), and count as a whole",
                 folder.display()
             ),
+            Self::PhotosOnDisk {
+                photos,
+                needed,
+                bound,
+            } => write!(
+                f,
+                "{photos} photos would need {} of memory, more than {}: each is decoded whenever it is needed, which takes time; read them smaller (--downscale) to keep them in memory",
+                in_units(*needed),
+                in_units(*bound)
+            ),
             Self::DamagedPhotos { count, first } => write!(
                 f,
                 "{count} photo(s) hold more or less data than their picture takes and are likely damaged, from `{first}`; look at them"
@@ -227,7 +248,7 @@ impl CaptureWarning {
             ),
             Self::OtherCapture { used, other } => write!(
                 f,
-                "{used} is read, and {} beside it is not; name that file instead of the folder to read it",
+                "{} is not read, because the folder has {used} too; name that file instead of the folder to read it",
                 other.display()
             ),
             Self::CropRadiusIgnored { path } => write!(
@@ -274,6 +295,7 @@ impl CaptureWarning {
             | Self::EmptyMasks { .. }
             | Self::PhotosWithoutMask { .. }
             | Self::DamagedPhotos { .. }
+            | Self::PhotosOnDisk { .. }
             | Self::UnregisteredPhotos { .. }
             | Self::MissingPhotos { .. }
             | Self::RepeatedPhotos { .. } => Ok(()),
