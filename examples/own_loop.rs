@@ -31,12 +31,12 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
     let mut model = Optimized::with_adam(gaussians, &rates, AdamRows::All, scale)?;
 
     // A view on the device: its camera and its photo.
-    let load = |view: &View| {
+    let load = |view: &View| -> Result<_, OpError> {
         let camera = CameraTensors::from_camera(&view.camera(), &device);
-        (camera, photo(view, &device))
+        Ok((camera, photo(view, &device)?))
     };
-    let views: Vec<_> = capture.train_views().map(load).collect();
-    let held_out: Vec<_> = capture.test_views().map(load).collect();
+    let views: Vec<_> = capture.train_views().map(load).collect::<Result<_, _>>()?;
+    let held_out: Vec<_> = capture.test_views().map(load).collect::<Result<_, _>>()?;
     let settings = RenderSettings::new().with_project(scale.project_settings());
     let ssim = losses::SsimSettings::new();
 

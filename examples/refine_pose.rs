@@ -50,7 +50,7 @@ fn main() -> Result<(), Box<dyn std::error::Error>> {
         Ok((splats, rendered.image()))
     };
 
-    let photo = burn_splat::train::photo(view, &device);
+    let photo = burn_splat::train::photo(view, &device)?;
     let (there, _) = look(camera.viewmats.clone())?;
     let shake = Tensor::from_floats([0.02, -0.04, 0.03, 0.02, -0.01, 0.03], &device);
     let moved = motion(shake, scale).matmul(camera.viewmats.clone());

@@ -69,7 +69,7 @@ pub fn held_out<M: SplatModel>(
     let camera = view.camera().relative_to(trained.model.origin());
     let camera = CameraTensors::from_camera(&camera, &device);
     let image = render(&trained.model, &camera, &trained.render_settings)?.image();
-    Ok([burn_splat::train::photo(view, &device), image])
+    Ok([burn_splat::train::photo(view, &device)?, image])
 }
 
 /// Peak signal-to-noise ratio of two images in dB.

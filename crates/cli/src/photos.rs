@@ -24,6 +24,10 @@ pub struct PhotoArgs {
     /// file that names them [default: those that the capture says, or every 8th]
     #[arg(long, value_name = "K|NAMES|FILE")]
     pub hold_out: Option<String>,
+    /// Memory for photos in MiB; if they take more, they are read from the disk whenever they are
+    /// needed [default: half of what is free]
+    #[arg(long, value_name = "MIB", value_parser = clap::value_parser!(u64).range(1..=1 << 30))]
+    pub photo_memory: Option<u64>,
 }
 
 /// The rule that a value of `--hold-out` is.
@@ -73,6 +77,7 @@ impl PhotoArgs {
             downscale: self.downscale.unwrap_or(default.downscale),
             images: self.images.clone(),
             split: self.hold_out.as_deref().map_or(default.split, hold_out),
+            memory: self.photo_memory.map(|mebibytes| mebibytes << 20),
         }
     }
 
@@ -96,6 +101,9 @@ impl PhotoArgs {
         }
         if let Some(rule) = &self.hold_out {
             words.extend(["--hold-out".into(), rule.into()]);
+        }
+        if let Some(memory) = self.photo_memory {
+            words.extend(["--photo-memory".into(), memory.to_string().into()]);
         }
         words
     }
@@ -130,7 +138,7 @@ mod tests {
             &["--images", "my photos", "--downscale", "3"][..],
             &["--images", "/data/photos"],
             &["--downscale", "2"],
-            &["--hold-out", "0"],
+            &["--hold-out", "0", "--photo-memory", "100"],
             &["--hold-out", "a.jpg,b/c.jpg"],
             &[],
         ] {

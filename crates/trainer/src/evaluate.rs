@@ -11,7 +11,7 @@ use splat_model::{
 };
 
 use crate::hooks::{HookView, Hooks, Purpose};
-use crate::photo::{mask, photo};
+use crate::photo::{loaded, mask_of, pixels_u8, values};
 
 /// Scores of one view.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -63,12 +63,13 @@ pub(crate) fn evaluate_with<M: SplatModel>(
     let mut scores = Vec::with_capacity(views.len());
     for view in views {
         let image = rendered(model, view, settings, device, hooks)?;
-        let target = photo(view, device);
+        let view = &*loaded(view)?;
+        let target = values(pixels_u8(view, device));
         let scalar = |value: Tensor<1>| -> Result<f64, OpError> {
             Ok(to_host(value)?.first().copied().map_or(f64::NAN, f64::from))
         };
         let settings = SsimSettings::default();
-        let [psnr, ssim] = match mask(view, device) {
+        let [psnr, ssim] = match mask_of(view, device) {
             None => [
                 psnr(image.clone(), target.clone()),
                 ssim(image.clone(), target, &settings)?,

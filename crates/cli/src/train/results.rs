@@ -289,7 +289,10 @@ impl RunFolder<'_> {
         }
         if self.undistort {
             let folder = self.folder.join(UNDISTORTED);
-            saving.keep(UNDISTORTED, refined.undistorted().save(&folder));
+            let undistorted = refined
+                .undistorted()
+                .and_then(|capture| capture.save(&folder));
+            saving.keep(UNDISTORTED, undistorted);
         }
         aligned
     }
@@ -369,10 +372,11 @@ pub(super) fn picture_names(capture: &Capture) -> ViewNames {
 }
 
 /// Writes photo and render side by side.
-fn write_view(path: &Path, view: &View, rendered: &[f32]) -> Result<(), ReportError> {
-    let truth = Picture::from_rgb8(view.width, view.height, view.image.to_vec())?;
+fn write_view(path: &Path, view: &View, rendered: &[f32]) -> Result<(), Failure> {
+    let photo = view.loaded()?;
+    let truth = Picture::from_rgb8(view.width, view.height, photo.image.to_vec())?;
     let render = Picture::from_rgb_f32(view.width, view.height, rendered)?;
-    truth.beside(&render)?.write(path)
+    Ok(truth.beside(&render)?.write(path)?)
 }
 
 /// History of the run: the weighted sum, then each term.

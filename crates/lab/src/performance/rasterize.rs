@@ -251,12 +251,10 @@ fn passes(
         .iter()
         .map(|view| {
             let camera = view.camera().relative_to(gaussians.origin);
-            (
-                CameraTensors::from_camera(&camera, &device),
-                photo(view, &device),
-            )
+            let photo = photo(view, &device)?;
+            Ok((CameraTensors::from_camera(&camera, &device), photo))
         })
-        .collect();
+        .collect::<Result<_, OpError>>()?;
     let record = |recording: &Recording| {
         let mut passes = vec![];
         let start = Instant::now();

@@ -5,15 +5,19 @@ use std::sync::Arc;
 use rayon::prelude::*;
 use splat_core::{CameraModel, Lens};
 
-use super::{Capture, View};
+use super::{Capture, CaptureError, View};
 
 impl Capture {
-    /// The capture with every photo undistorted, see [`View::undistorted`].
-    pub fn undistorted(&self) -> Self {
-        Self {
-            views: self.views.par_iter().map(View::undistorted).collect(),
+    /// The capture with every photo undistorted and in memory, see [`View::undistorted`].
+    ///
+    /// # Errors
+    /// When a photo that is on the disk cannot be read.
+    pub fn undistorted(&self) -> Result<Self, CaptureError> {
+        let views = self.views.par_iter().map(View::undistorted);
+        Ok(Self {
+            views: views.collect::<Result<_, _>>()?,
             ..self.clone()
-        }
+        })
     }
 }
 
@@ -21,10 +25,19 @@ impl View {
     /// The view as a pinhole camera of the same size, focal lengths and principal point would have
     /// taken it. What the pinhole sees and the photo does not is black and masked; what lies
     /// outside of the pinhole's image is lost.
-    pub fn undistorted(&self) -> Self {
-        if self.lens.model() == CameraModel::Pinhole {
-            return self.clone();
-        }
+    ///
+    /// # Errors
+    /// When a photo that is on the disk cannot be read.
+    pub fn undistorted(&self) -> Result<Self, CaptureError> {
+        let view = self.loaded()?.into_owned();
+        Ok(match view.lens.model() {
+            CameraModel::Pinhole => view,
+            _ => view.straightened(),
+        })
+    }
+
+    /// [`undistorted`](Self::undistorted), of a photo in memory.
+    fn straightened(&self) -> Self {
         let (w, h) = (self.width as usize, self.height as usize);
         let [fx, fy, cx, cy] = self.intrinsics;
         let lens = self.lens.bounded();
@@ -115,6 +128,7 @@ mod tests {
             image: Arc::new(image.collect()),
             mask: None,
             depth: None,
+            on_disk: None,
         }
     }
 
@@ -125,7 +139,7 @@ mod tests {
         let pincushion = Lens::OpenCv([0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
         let fisheye = Lens::OpenCvFisheye([0.05, 0.0, 0.0, 0.0]);
         for (lens, covers) in [(barrel, true), (pincushion, false), (fisheye, true)] {
-            let view = taken(lens).undistorted();
+            let view = taken(lens).undistorted().unwrap();
             assert_eq!(view.lens, Lens::Pinhole);
             let mask = |at: usize| view.mask.as_ref().is_none_or(|mask| mask[at] == 255);
             let kept = (0..80 * 60).filter(|at| mask(*at));
@@ -139,6 +153,6 @@ mod tests {
                 off.iter().max()
             );
         }
-        assert_eq!(straight.undistorted().image, straight.image);
+        assert_eq!(straight.undistorted().unwrap().image, straight.image);
     }
 }

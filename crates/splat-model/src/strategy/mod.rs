@@ -121,7 +121,10 @@ pub trait TrainingViews {
     fn camera(&self, view: usize) -> CameraTensors;
 
     /// The photo of a view, `[1, H, W, 3]` in [0, 1].
-    fn photo(&self, view: usize) -> Tensor<4>;
+    ///
+    /// # Errors
+    /// When it is not in memory and cannot be read.
+    fn photo(&self, view: usize) -> Result<Tensor<4>, OpError>;
 }
 
 /// Counts of a change of rows.

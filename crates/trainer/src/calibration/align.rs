@@ -15,7 +15,7 @@ use splat_ops::{OpError, photometric, photometric_masked};
 use super::motion::{MOTION, moved, moved_f64};
 use crate::Scores;
 use crate::hooks::{HookView, Hooks, Purpose};
-use crate::photo::{mask, pixels_u8};
+use crate::photo::{loaded, mask_of, pixels_u8};
 
 /// Scores of held-out views whose poses were aligned with the scene, and those poses.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -82,7 +82,8 @@ impl Aligning<'_> {
         let camera = view.camera();
         let cameras = CameraTensors::from_camera(&camera.relative_to(model.origin()), &device);
         let cameras = self.hooks.cameras(&hook_view, cameras)?;
-        let (photo, mask) = (pixels_u8(view, &device), mask(view, &device));
+        let view = &*loaded(view)?;
+        let (photo, mask) = (pixels_u8(view, &device), mask_of(view, &device));
         let args = SsimSettings::default().args();
         let mut motion = Tensor::<2>::zeros([1, MOTION], &device);
         let (adam, mut state) = (SplatAdam::new(), None);

@@ -207,7 +207,7 @@ impl<M: SplatModel> TrainerBuilder<M> {
         self.hooks.0.splice(0..0, calibrating);
         check_hook_names(&self.hooks)?;
         let mut record = RunRecord {
-            capture: Fingerprint::of(&self.capture),
+            capture: Fingerprint::of(&self.capture)?,
             config: self.config.clone(),
             changes: Vec::new(),
         };

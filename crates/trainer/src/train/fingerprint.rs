@@ -3,7 +3,7 @@
 use rayon::prelude::*;
 use serde::{Deserialize, Serialize};
 
-use splat_data::{CameraModel, Capture, View};
+use splat_data::{CameraModel, Capture, CaptureError, View};
 
 /// Properties that identify a capture: for each view name, size, camera, use and photo; and the
 /// points.
@@ -39,20 +39,24 @@ enum Usage {
 
 impl Fingerprint {
     /// Fingerprint of a capture as loaded, downscaling included.
-    pub(super) fn of(capture: &Capture) -> Self {
-        let mut views: Vec<_> = capture.views.par_iter().map(ViewPrint::of).collect();
+    ///
+    /// # Errors
+    /// When a photo that is on the disk cannot be read.
+    pub(super) fn of(capture: &Capture) -> Result<Self, CaptureError> {
+        let views = capture.views.par_iter().map(ViewPrint::of);
+        let mut views: Vec<_> = views.collect::<Result<_, _>>()?;
         for &index in &capture.split.train {
             views[index].usage = Usage::TrainedOn;
         }
         for &index in &capture.split.test {
             views[index].usage = Usage::HeldOut;
         }
-        Self {
+        Ok(Self {
             name: capture.name.clone(),
             points: capture.points.len(),
             positions: positions(capture),
             views,
-        }
+        })
     }
 
     /// Name of the capture's folder.
@@ -136,7 +140,7 @@ fn positions(capture: &Capture) -> u32 {
 }
 
 impl ViewPrint {
-    fn of(view: &View) -> Self {
+    fn of(view: &View) -> Result<Self, CaptureError> {
         let numbers = view.intrinsics.iter().chain(view.viewmat.as_flattened());
         let numbers = numbers.chain(view.lens.coefficients());
         let mut camera: Vec<u8> = numbers.flat_map(|value| value.to_le_bytes()).collect();
@@ -144,15 +148,16 @@ impl ViewPrint {
             camera.extend(view.lens.model().name().as_bytes());
         }
         let mut photo = crc32fast::Hasher::new();
-        photo.update(&view.image);
-        photo.update(view.mask.as_ref().map_or(&[][..], |mask| mask));
-        Self {
+        let loaded = view.loaded()?;
+        photo.update(&loaded.image);
+        photo.update(loaded.mask.as_ref().map_or(&[][..], |mask| mask));
+        Ok(Self {
             name: view.name.clone(),
             size: [view.width, view.height],
             camera: crc32fast::hash(&camera),
             photo: photo.finalize(),
             usage: Usage::NotUsed,
-        }
+        })
     }
 }
 
@@ -195,7 +200,7 @@ mod tests {
     #[test]
     fn what_differs_is_said() {
         let capture = capture();
-        let print = Fingerprint::of(&capture);
+        let print = Fingerprint::of(&capture).unwrap();
         let json = serde_json::to_string(&print).unwrap();
         assert_eq!(serde_json::from_str::<Fingerprint>(&json).unwrap(), print);
 
@@ -207,7 +212,7 @@ mod tests {
         for change in same {
             let mut given = capture.clone();
             change(&mut given);
-            assert_eq!(print.difference(&Fingerprint::of(&given)), None);
+            assert_eq!(print.difference(&Fingerprint::of(&given).unwrap()), None);
         }
         // `{N}` is the name of view N.
         let changes: [Change; 7] = [
@@ -244,7 +249,7 @@ mod tests {
             if given.views.len() < capture.views.len() {
                 given.split = Split::every_eighth(given.views.len());
             }
-            let said = print.difference(&Fingerprint::of(&given)).unwrap();
+            let said = print.difference(&Fingerprint::of(&given).unwrap()).unwrap();
             for word in words {
                 let index = word.strip_prefix('{').and_then(|w| w.strip_suffix('}'));
                 let index = index.and_then(|index| index.parse::<usize>().ok());
@@ -257,10 +262,13 @@ mod tests {
     #[test]
     fn photos_of_other_pixels_are_named() {
         let mut given = capture();
-        let print = Fingerprint::of(&given);
+        let print = Fingerprint::of(&given).unwrap();
         Arc::make_mut(&mut given.views[3].image).fill(0);
         let name = given.views[3].name.clone();
-        assert_eq!(print.changed_photos(&Fingerprint::of(&given)), [name]);
+        assert_eq!(
+            print.changed_photos(&Fingerprint::of(&given).unwrap()),
+            [name]
+        );
         assert!(print.changed_photos(&print).is_empty());
     }
 }

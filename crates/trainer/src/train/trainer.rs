@@ -25,7 +25,7 @@ use super::{
     views, warnings,
 };
 use crate::hooks::{HookView, Purpose};
-use crate::photo::{mask, pixels_u8};
+use crate::photo::{mask_of, pixels_u8};
 
 /// A training run.
 ///
@@ -197,6 +197,7 @@ impl<M: SplatModel> Trainer<M> {
         let factor = self.state.strategy.photo_factor(at);
         let factor = factor.unwrap_or_else(|| resolution_schedule::factor(&self.config, at));
         let view = self.coarse.view(&self.capture, index, factor.max(1));
+        let view = view.loaded()?;
         let model = self.state.model.model();
         let hooks = &self.state.hooks;
         let hook_view = HookView {
@@ -226,7 +227,7 @@ impl<M: SplatModel> Trainer<M> {
         drop(render);
         let pixels = trace_span!("photo").in_scope(|| pixels_u8(&view, &self.device));
         let target = TargetView::new(&view.name, pixels, &cameras, at.step)
-            .with_mask(mask(&view, &self.device));
+            .with_mask(mask_of(&view, &self.device));
         let evaluated = trace_span!("loss").in_scope(|| self.loss.evaluate(&target, &rendered))?;
         let Some((mut loss, mut terms)) = evaluated else {
             return Err(TrainError::Loss("has no term"));

@@ -4,6 +4,7 @@ use burn::tensor::{Device, Tensor};
 use splat_data::Capture;
 use splat_model::CameraTensors;
 use splat_model::strategy::TrainingViews;
+use splat_ops::OpError;
 
 use crate::photo::photo;
 
@@ -30,7 +31,7 @@ impl TrainingViews for CaptureViews<'_> {
         CameraTensors::from_camera(&camera, self.device)
     }
 
-    fn photo(&self, view: usize) -> Tensor<4> {
+    fn photo(&self, view: usize) -> Result<Tensor<4>, OpError> {
         photo(self.view(view), self.device)
     }
 }

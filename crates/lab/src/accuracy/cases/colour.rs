@@ -104,8 +104,9 @@ fn large_and_eight_bit(device: &Device) -> Result<Outcome, AccuracyError> {
         image: Arc::new((0..=255).flat_map(|level| [level; 3]).collect()),
         mask: None,
         depth: None,
+        on_disk: None,
     };
-    let photo = splat_trainer::photo(&view, device)
+    let photo = splat_trainer::photo(&view, device)?
         .try_into_vec_as::<f64>()
         .map_err(|error| AccuracyError::Read(error.to_string()))?;
     let worst = photo.iter().enumerate().map(|(i, value)| {

@@ -148,6 +148,7 @@ fn view(index: usize, width: u32, height: u32) -> View {
         image: Arc::new(image),
         mask: None,
         depth: None,
+        on_disk: None,
     }
 }
 

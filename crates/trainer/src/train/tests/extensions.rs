@@ -135,7 +135,7 @@ impl<M: SplatModel> Strategy<M> for Everything {
         if context.at.step != 4 {
             return Ok(None);
         }
-        let (camera, photo) = (context.views.camera(0), context.views.photo(0));
+        let (camera, photo) = (context.views.camera(0), context.views.photo(0)?);
         let error = photo.slice([
             0..1,
             0..camera.size.height as usize,

@@ -183,6 +183,10 @@ fn noise(views: &[View]) -> Option<Warning> {
 /// True if neighbours in a row of the photo's green channel are uncorrelated. A photo of one colour
 /// is not noise.
 fn is_noise(view: &View) -> bool {
+    // A photo that cannot be read ends the run with an error of its own.
+    let Ok(view) = view.loaded() else {
+        return false;
+    };
     let width = view.width as usize;
     let every = (view.height / NOISE_ROWS).max(1) as usize;
     let rows: Vec<Vec<f64>> = view
