@@ -109,12 +109,13 @@ impl Coefficients {
 
 /// One value, or zero if there are none.
 #[cube]
-fn value(values: &ComptimeOption<&[f32]>, at: usize) -> f32 {
-    let mut value = 0.0f32;
+fn value_or_zero(values: &ComptimeOption<&[f32]>, at: usize) -> f32 {
+    let mut found = 0.0f32;
+    #[comptime]
     if let ComptimeOption::Some(values) = values {
-        value = values[at];
+        found += values[at];
     }
-    value
+    found
 }
 
 #[cube]
@@ -129,19 +130,19 @@ impl Lens {
         let width = comptime!(model.coefficients());
         let at = index * width;
         if comptime!(width > 0) {
-            k.c0 = value(distortion, at);
-            k.c1 = value(distortion, at + 1);
-            k.c2 = value(distortion, at + 2);
-            k.c3 = value(distortion, at + 3);
+            k.c0 = value_or_zero(distortion, at);
+            k.c1 = value_or_zero(distortion, at + 1);
+            k.c2 = value_or_zero(distortion, at + 2);
+            k.c3 = value_or_zero(distortion, at + 3);
         }
         if comptime!(width > 4) {
-            k.c4 = value(distortion, at + 4);
-            k.c5 = value(distortion, at + 5);
-            k.c6 = value(distortion, at + 6);
-            k.c7 = value(distortion, at + 7);
+            k.c4 = value_or_zero(distortion, at + 4);
+            k.c5 = value_or_zero(distortion, at + 5);
+            k.c6 = value_or_zero(distortion, at + 6);
+            k.c7 = value_or_zero(distortion, at + 7);
         }
-        let limit = value(domain, index * 2);
-        let clamp = value(domain, index * 2 + 1);
+        let limit = value_or_zero(domain, index * 2);
+        let clamp = value_or_zero(domain, index * 2 + 1);
         Lens { k, limit, clamp }
     }
 }
