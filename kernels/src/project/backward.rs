@@ -11,9 +11,15 @@ use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_elemen
 use crate::math::{Quat, Vec3};
 
 /// Values of a camera's gradient: three rows [W | t], then fx, fy, cx, cy, then the coefficients of
-/// the lens, filled up to a power of two, which divides the units of a workgroup.
+/// the lens.
 const fn camera_values(model: CameraModel) -> usize {
-    (16 + model.coefficients()).next_power_of_two()
+    16 + model.coefficients()
+}
+
+/// Entries that one unit adds up, of those of all units of a workgroup for one value. A power of
+/// two, which divides the units, and enough that the units suffice for all values.
+const fn camera_share(model: CameraModel) -> usize {
+    camera_values(model).next_power_of_two()
 }
 
 /// Gaussians summed by one unit of the camera gradient.
@@ -166,17 +172,20 @@ fn project_backward_cameras(
     sync_cube();
     // The units of a workgroup share the values, each value in equal parts; then one unit per value
     // adds its parts.
-    let mut part = 0.0f32;
-    for k in 0..values {
-        part += shared[unit * values + k];
+    let share = comptime!(camera_share(model));
+    let parts_of_each = comptime!(CUBE_UNITS_USIZE / camera_share(model));
+    if unit < values * parts_of_each {
+        let mut part = 0.0f32;
+        for k in 0..share {
+            part += shared[unit * share + k];
+        }
+        parts[unit] = part;
     }
-    parts[unit] = part;
     sync_cube();
     if unit < values && c < cameras as usize {
         let mut sum = 0.0f32;
-        let share = comptime!(CUBE_UNITS_USIZE / camera_values(model));
-        for k in 0..share {
-            sum += parts[unit * share + k];
+        for k in 0..parts_of_each {
+            sum += parts[unit * parts_of_each + k];
         }
         partials[CUBE_POS * values + unit] = sum;
     }

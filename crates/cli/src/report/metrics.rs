@@ -66,6 +66,7 @@ mod tests {
         };
         let metrics = Metrics {
             scores: Scores::of_views(vec![view("a", 20.0, 0.5), view("b", 23.0, 0.75)]),
+            aligned: None,
             gaussians: 3,
             steps: 10,
             seconds: 5.0,

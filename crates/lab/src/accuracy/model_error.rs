@@ -38,7 +38,10 @@ use glam::{DMat3, DQuat, DVec3};
 use rayon::prelude::*;
 use serde::Serialize;
 use splat_model::Camera;
-use splat_ops::{ImageSize, OpError, ProjectSettings, RasterizeSettings, project, rasterize};
+use splat_ops::{
+    CameraModel, Distortion, ImageSize, Intrinsics, OpError, ProjectSettings, RasterizeSettings,
+    project, rasterize,
+};
 
 /// A Gaussian in the world, after activation.
 #[derive(Debug, Clone, Copy, PartialEq)]

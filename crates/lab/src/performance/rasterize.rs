@@ -254,7 +254,7 @@ fn passes(
             let photo = photo(view, &device)?;
             Ok((CameraTensors::from_camera(&camera, &device), photo))
         })
-        .collect::<Result<_, OpError>>()?;
+        .collect::<Result<_, splat_ops::OpError>>()?;
     let record = |recording: &Recording| {
         let mut passes = vec![];
         let start = Instant::now();
