@@ -35,7 +35,7 @@ fn check(number: u8, backend: &str, device: &Device) {
 #[test]
 fn every_number_is_there_once() {
     let numbers: Vec<u8> = cases().iter().map(|case| case.number).collect();
-    assert_eq!(numbers, (1..=38).collect::<Vec<u8>>());
+    assert_eq!(numbers, (1..=44).collect::<Vec<u8>>());
 }
 
 macro_rules! hard_cases {
@@ -93,6 +93,12 @@ hard_cases! {
     case_36_adam_spike: 36,
     case_37_large_sh_eight_bit: 37,
     case_38_relocation: 38,
+    case_39_on_the_axis: 39,
+    case_40_strong_distortion: 40,
+    case_41_near_the_fold: 41,
+    case_42_off_the_axis: 42,
+    case_43_needle_at_the_edge: 43,
+    case_44_antialiased_fold: 44,
 }
 
 /// Needles up to 10,000 : 1: the determinant is accurate to 1e-3 and the exponent to 1e-2, and

@@ -124,6 +124,60 @@ fn refused(output: &Output, out: &Path, words: &[&str]) {
     assert!(!out.exists(), "something was written");
 }
 
+/// Random points take the place of missing ones, with a word.
+#[test]
+fn a_capture_without_points_is_trained() {
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("out");
+    let capture = example(folder.path());
+    fs::remove_file(capture.join("sparse/0/points3D.bin")).unwrap();
+    let output = train(&capture, &out, &["--steps", "1", "--hold-out", "16"]);
+    succeed(&output);
+    let errors = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(
+        errors.contains("warning: ") && errors.contains("random"),
+        "{errors}"
+    );
+    assert_eq!(metrics(&out)["gaussians"], 100_000);
+    assert_eq!(metrics(&out)["views"].as_array().unwrap().len(), 2);
+}
+
+/// Refined cameras and undistorted photos are captures like any other.
+#[test]
+fn cameras_are_refined_and_written() {
+    let folder = TempDir::new().unwrap();
+    let out = folder.path().join("out");
+    let capture = example(folder.path());
+    let flags = [
+        "--steps",
+        "5",
+        "--refine-poses",
+        "--refine-intrinsics",
+        "--undistort",
+    ];
+    succeed(&train(&capture, &out, &flags));
+    let aligned = metrics(&out)["aligned"]["psnr"].as_f64().unwrap();
+    assert!(aligned > 5.0, "{aligned}");
+    let refined = splat(&["info", text(&out.join("undistorted"))]);
+    succeed(&refined);
+    let said = String::from_utf8_lossy(&refined.stdout).into_owned();
+    assert!(said.contains("pinhole  fx"), "{said}");
+    let images = capture.join("images");
+    let cameras = out.join("cameras");
+    let refined = splat(&["info", text(&cameras), "--images", text(&images)]);
+    succeed(&refined);
+    let said = String::from_utf8_lossy(&refined.stdout).into_owned();
+    assert!(
+        said.contains("opencv  fx") && said.contains("  k1 "),
+        "{said}"
+    );
+    // Undistorted photos are not replaced.
+    let again = train(&capture, &out, &flags);
+    assert_eq!(again.status.code(), Some(2));
+    let errors = String::from_utf8_lossy(&again.stderr).into_owned();
+    assert!(errors.contains("undistorted: there already"), "{errors}");
+}
+
 #[test]
 fn bad_captures_are_refused_in_one_line() {
     let folder = TempDir::new().unwrap();
@@ -148,7 +202,7 @@ fn bad_captures_are_refused_in_one_line() {
 
     let points = capture.join("sparse/0/points3D.bin");
     let kept = fs::read(&points).unwrap();
-    fs::write(&points, 0u64.to_le_bytes()).unwrap();
+    fs::write(&points, 9u64.to_le_bytes()).unwrap();
     refused(
         &train(&capture, &out, &[]),
         &out,

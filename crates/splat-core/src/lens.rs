@@ -1,7 +1,7 @@
 //! Lenses: what lies between a point in camera space and the image plane.
 //!
-//! A point p = (x, y, z) in camera space falls on the normalised image plane at (a', b'), and in the
-//! image at (fx a' + cx, fy b' + cy):
+//! A point p = (x, y, z) in camera space falls on the normalised image plane at (a', b'), and in
+//! the image at (fx a' + cx, fy b' + cy):
 //!
 //! ```text
 //! pinhole         a' = x/z,  b' = y/z
@@ -13,7 +13,8 @@
 //!                 a' = theta_d x / rho,  b' = theta_d y / rho
 //! ```
 //!
-//! These are the models of OpenCV's `calib3d` and `fisheye` modules, and COLMAP's of the same names.
+//! These are the models of OpenCV's `calib3d` and `fisheye` modules, and COLMAP's of the same
+//! names.
 
 mod fisheye;
 mod opencv;
@@ -205,8 +206,8 @@ impl BoundedLens {
         }
     }
 
-    /// The direction in camera space, of length 1 for a fisheye and with z = 1 else, that falls on a
-    /// point of the normalised image plane; `None` where no direction of the domain does.
+    /// The direction in camera space, of length 1 for a fisheye and with z = 1 else, that falls on
+    /// a point of the normalised image plane; `None` where no direction of the domain does.
     pub fn undistort(&self, point: [f64; 2]) -> Option<[f64; 3]> {
         match &self.lens {
             Lens::Pinhole => Some([point[0], point[1], 1.0]),

@@ -29,8 +29,8 @@ pub fn psnr(image: Tensor<4>, target: Tensor<4>) -> Tensor<1> {
     mse(image.clamp(0.0, 1.0), target.clamp(0.0, 1.0)).log() * (-10.0 / core::f64::consts::LN_10)
 }
 
-/// [`psnr`] over the pixels that a mask `[B, H, W, 1]` keeps, from 0 (ignored) to 1; NaN if it keeps
-/// none.
+/// [`psnr`] over the pixels that a mask `[B, H, W, 1]` keeps, from 0 (ignored) to 1; NaN if it
+/// keeps none.
 pub fn psnr_masked(image: Tensor<4>, target: Tensor<4>, mask: Tensor<4>) -> Tensor<1> {
     let squares = (image.clamp(0.0, 1.0) - target.clamp(0.0, 1.0)).square();
     mean_of_kept(squares, mask).log() * (-10.0 / core::f64::consts::LN_10)

@@ -168,11 +168,11 @@ fn tracked(leaf: Tensor<3>) -> Tensor<3> {
 ///
 /// The screen mean is that of the camera model, exactly; J is the model's Jacobian at the mean. For
 /// perspective cameras it is evaluated inside the image and a margin around it, because EWA's
-/// approximation explodes beyond. The 2D covariance is `V V^T + eps2d I`, V = J W R diag(s), with its determinant from the
-/// minors of V, which keeps needles exact in single precision. Splats are culled (row of zeros, no
-/// gradient) when their depth is outside [near, far], when they are outside of the lens's
-/// domain, when they do not reach the image, when their quaternion has no length, or when one of
-/// their fields is not finite.
+/// approximation explodes beyond. The 2D covariance is `V V^T + eps2d I`, V = J W R diag(s), with
+/// its determinant from the minors of V, which keeps needles exact in single precision. Splats are
+/// culled (row of zeros, no gradient) when their depth is outside [near, far], when they are
+/// outside of the lens's domain, when they do not reach the image, when their quaternion has no
+/// length, or when one of their fields is not finite.
 ///
 /// ```
 /// use burn::tensor::{Device, Tensor};

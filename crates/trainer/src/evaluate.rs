@@ -35,9 +35,9 @@ pub struct Scores {
     pub views: Vec<ViewScore>,
 }
 
-/// Renders every view and compares it with its photo, over the pixels that its mask keeps. `each` receives every view with its image, `H
-/// x W x 3` values clamped to [0, 1], for callers that keep images. [`Trainer`](crate::Trainer) has
-/// an example.
+/// Renders every view and compares it with its photo, over the pixels that its mask keeps. `each`
+/// receives every view with its image, `H x W x 3` values clamped to [0, 1], for callers that keep
+/// images. [`Trainer`](crate::Trainer) has an example.
 ///
 /// # Errors
 /// When an op refuses its input, or the device fails.
@@ -111,8 +111,8 @@ fn rendered<M: SplatModel>(
 }
 
 impl Scores {
-    /// Adds the means to scores of views; NaN if there are no views. A view without a score, because
-    /// its mask keeps no pixel, counts in no mean.
+    /// Adds the means to scores of views; NaN if there are no views. A view without a score,
+    /// because its mask keeps no pixel, counts in no mean.
     pub fn of_views(views: Vec<ViewScore>) -> Self {
         let mean = |score: fn(&ViewScore) -> f64| {
             let scores = views.iter().map(score).filter(|score| !score.is_nan());

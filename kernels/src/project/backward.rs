@@ -232,9 +232,9 @@ fn sum_camera_partials(
     }
 }
 
-/// Gradients of means [N, 3], quats [N, 4], scales [N, 3], viewmats [C, 4, 4], intrinsics [C, 4] and
-/// distortion [C, K], from the gradient of the packed splats [C, N, 9]; only those that `needs_grad`
-/// names.
+/// Gradients of means [N, 3], quats [N, 4], scales [N, 3], viewmats [C, 4, 4], intrinsics [C, 4]
+/// and distortion [C, K], from the gradient of the packed splats [C, N, 9]; only those that
+/// `needs_grad` names.
 pub fn project_backward(
     client: &Client,
     inputs: &ProjectInputs,

@@ -9,9 +9,9 @@
 //!           [e nx ny,    s + e ny²,  -m ny]          e = (m cos t - s) / sin² t
 //! ```
 //!
-//! All of s, e and m are smooth functions of t², and so are their derivatives divided by t, on which
-//! the gradient stands: nothing is divided by the distance from the axis. Where the closed forms
-//! cancel, near the axis, they are series. A dot is a derivative by t divided by t:
+//! All of s, e and m are smooth functions of t², and so are their derivatives divided by t, on
+//! which the gradient stands: nothing is divided by the distance from the axis. Where the closed
+//! forms cancel, near the axis, they are series. A dot is a derivative by t divided by t:
 //!
 //! ```text
 //! h. = (1 - h cos t) / (h sin² t)           h.. = (1 - 3 h. cos t - h.² sin² t) / (h sin² t)

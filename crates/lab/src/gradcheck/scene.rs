@@ -61,7 +61,8 @@ pub struct Outputs {
     pub image: Array,
     /// `[H, W, 1]`.
     pub alpha: Array,
-    /// `[H, W, 1]`, accumulated depth: camera z, or the distance for a fisheye. Present if the fixture has a depth loss or image.
+    /// `[H, W, 1]`, accumulated depth: camera z, or the distance for a fisheye. Present if the
+    /// fixture has a depth loss or image.
     pub depth: Option<Array>,
 }
 

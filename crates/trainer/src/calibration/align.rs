@@ -34,9 +34,9 @@ const RATE: f64 = 2e-3;
 /// Aligns the pose of one view with a scene that stays as it is, by gradients of the training loss,
 /// and returns the camera.
 ///
-/// A scene that was trained with poses of its own has moved away from those of the capture, a little
-/// and with all of its views. The score of a held-out view at its old pose measures that move; at
-/// its aligned pose, the scene.
+/// A scene that was trained with poses of its own has moved away from those of the capture, a
+/// little and with all of its views. The score of a held-out view at its old pose measures that
+/// move; at its aligned pose, the scene.
 ///
 /// # Errors
 /// When an op refuses its input, or the device fails.

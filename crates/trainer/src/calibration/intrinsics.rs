@@ -113,8 +113,8 @@ struct Correction {
 /// views that begin with the same camera.
 ///
 /// A pinhole gets the coefficients k1, k2, p1, p2 of [`CameraModel::OpenCv`], zero at first; lenses
-/// with distortion keep their model. Held-out views have the refined cameras too. The domains of the
-/// lenses follow their coefficients every 100 steps.
+/// with distortion keep their model. Held-out views have the refined cameras too. The domains of
+/// the lenses follow their coefficients every 100 steps.
 pub struct RefineIntrinsics {
     corrections: Optimized<Corrections>,
     cameras: Vec<Physical>,

@@ -2,8 +2,8 @@
 //!
 //! A motion of six numbers turns by the rotation vector (r1, r2, r3), in radians for small angles,
 //! and then shifts by `length` times the rest, both in the axes of the camera. With u = r / 2 and K
-//! the matrix of the cross product with u, the rotation is Cayley's: `I + 2 (K + K^2) / (1 + |u|^2)`.
-//! It is a rotation exactly, for any r, and needs no sine.
+//! the matrix of the cross product with u, the rotation is Cayley's: `I + 2 (K + K^2) / (1 +
+//! |u|^2)`. It is a rotation exactly, for any r, and needs no sine.
 
 use burn::tensor::Tensor;
 use glam::{DMat3, DMat4, DVec3};
