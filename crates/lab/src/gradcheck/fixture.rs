@@ -222,8 +222,9 @@ impl Reader<'_> {
     ) -> Result<Vec<f64>, GradcheckError> {
         if has {
             let domain = self.exactly("domain", shape)?;
-            let sign =
-                |at: usize| at % 2 == 0 && domain.values[at] <= 0.0 || domain.values[at] < 0.0;
+            let sign = |at: usize| {
+                at.is_multiple_of(2) && domain.values[at] <= 0.0 || domain.values[at] < 0.0
+            };
             return match (0..domain.values.len()).find(|at| sign(*at)) {
                 None => Ok(domain.values),
                 Some(at) => {
