@@ -99,7 +99,7 @@ impl SsimSettings {
 /// Mean structural similarity (Wang et al. 2004), `[1]`, over channels and over the pixels whose
 /// window lies inside the image, as in scikit-image, torchmetrics and gsplat. In an image smaller
 /// than the window every pixel counts, with zeros outside. The target is a constant;
-/// [`ssim_map`](splat_ops::ssim_map) is differentiable in both images.
+/// [`ssim_map`] is differentiable in both images.
 ///
 /// # Errors
 /// When the shapes differ, the target is tracked by autodiff, or the window size is even.
