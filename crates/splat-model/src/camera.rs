@@ -63,6 +63,20 @@ impl CameraTensors {
         }
     }
 
+    /// The same cameras as constants, which pass no gradient on.
+    #[must_use]
+    pub fn detached(self) -> Self {
+        Self {
+            viewmats: self.viewmats.detach(),
+            intrinsics: self.intrinsics.detach(),
+            distortion: self.distortion.map(|distortion| Distortion {
+                coefficients: distortion.coefficients.detach(),
+                ..distortion
+            }),
+            size: self.size,
+        }
+    }
+
     /// The intrinsics with the distortion, as [`project`](splat_ops::project()) takes them.
     pub fn lens_intrinsics(&self) -> Intrinsics {
         Intrinsics {

@@ -81,7 +81,8 @@ impl Aligning<'_> {
         };
         let camera = view.camera();
         let cameras = CameraTensors::from_camera(&camera.relative_to(model.origin()), &device);
-        let cameras = self.hooks.cameras(&hook_view, cameras)?;
+        // Of what is not aligned here, the graph would be used up by the first step.
+        let cameras = self.hooks.cameras(&hook_view, cameras)?.detached();
         let view = &*loaded(view)?;
         let (photo, mask) = (pixels_u8(view, &device), mask_of(view, &device));
         let args = SsimSettings::default().args();

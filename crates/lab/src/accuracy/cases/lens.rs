@@ -110,7 +110,12 @@ fn about_the_fold(lens: Lens, antialias: bool, axes: f64) -> Scene {
         let edge = edge.map_or(1.0, |[a, b]| a.hypot(b));
         let mut sketch = sketch("near the fold", lens, 18.0 / edge, seed);
         sketch.antialias = antialias;
-        sketch.scatter(4, (0.2, 0.6));
+        for i in 0..4 {
+            let (sin, cos) = (1.6 * f64::from(i)).sin_cos();
+            let quat = sketch.turn();
+            let pixel = [20.0 + 7.3 * cos, 20.0 + 7.3 * sin];
+            sketch.splat(pixel, 1.5 + 0.1 * f64::from(i), [2.0, 3.0, 1.0], quat, 0.4);
+        }
         for i in 0..12 {
             let share = 0.9 + 0.0075 * f64::from(i);
             let depth = 2.0 + 0.2 * f64::from(i);
