@@ -17,14 +17,14 @@ pub struct CalibrationSettings {
     /// Refine focal lengths, principal points and distortion, one set for all views that begin with
     /// the same. Default false.
     pub intrinsics: bool,
-    /// Rate of poses: radians for rotations, sizes of the scene for translations. Default 1e-4;
-    /// gsplat has 1e-5, which corrects a fraction of a degree.
+    /// Rate of poses: radians for rotations, sizes of the scene for translations. Default 1e-3;
+    /// gsplat has 1e-5, which corrects a fraction of a degree in its 30,000 steps.
     pub pose_rate: f64,
-    /// Rate of the logarithms of focal lengths. Default 1e-4.
+    /// Rate of the logarithms of focal lengths. Default 1e-3.
     pub focal_rate: f64,
-    /// Rate of principal points, in sides of the photo. Default 1e-4.
+    /// Rate of principal points, in sides of the photo. Default 3e-4.
     pub principal_rate: f64,
-    /// Rate of distortion coefficients. Default 3e-4.
+    /// Rate of distortion coefficients. Default 2e-3.
     pub distortion_rate: f64,
     /// All rates fall exponentially to this share of themselves at the end of the run. Default
     /// 0.01 (gsplat).
@@ -78,10 +78,10 @@ impl Default for CalibrationSettings {
         Self {
             poses: false,
             intrinsics: false,
-            pose_rate: 1e-4,
-            focal_rate: 1e-4,
-            principal_rate: 1e-4,
-            distortion_rate: 3e-4,
+            pose_rate: 1e-3,
+            focal_rate: 1e-3,
+            principal_rate: 3e-4,
+            distortion_rate: 2e-3,
             final_share: 0.01,
             align_steps: 200,
         }

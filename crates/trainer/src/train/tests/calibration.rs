@@ -183,5 +183,5 @@ fn a_view_is_rendered_through_its_lens() {
     let mut k = [0.0; 8];
     k[0] = -0.2;
     let bent = worst(&image(Lens::OpenCv(k)), &straight);
-    assert!(bent > 0.1 && same < 0.2 * bent, "{same} {bent}");
+    assert!(bent > 0.03 && same < 0.2 * bent, "{same} {bent}");
 }
