@@ -38,8 +38,9 @@ const AUTOSAVE: u64 = 60;
   splat train photos/ --resume out/garden
 
 Writes to DIR: scene.ply, metrics.json, config.toml, curves.svg, losses.csv and views/*.png (truth
-beside render); with --refine-poses or --refine-intrinsics also cameras/, a COLMAP model. Ctrl-C finishes the step, writes the scene and a checkpoint to resume from; a second
-Ctrl-C ends at once. A checkpoint is also written every minute, so that --resume goes on after a crash.
+beside render); with --refine-poses or --refine-intrinsics also cameras/, a COLMAP model. Ctrl-C
+finishes the step, writes the scene and a checkpoint to resume from; a second Ctrl-C ends at once.
+A checkpoint is also written every minute, so that --resume goes on after a crash.
 
 --resume takes the settings of the run from its checkpoint, and refuses another capture, another seed
 and the like. --steps and --max-gaussians may be given anew: they hold from there on, schedules follow
@@ -169,6 +170,9 @@ impl TrainArgs {
         }
         if let Some(rule) = &self.photos.hold_out {
             line = line.option("--hold-out", rule.as_ref());
+        }
+        if let Some(memory) = self.photos.photo_memory {
+            line = line.option("--photo-memory", memory.to_string().as_ref());
         }
         line
     }

@@ -173,6 +173,12 @@ fn cameras_are_refined_and_written() {
         said.contains("opencv  fx") && said.contains("  k1 "),
         "{said}"
     );
+    // Refined cameras are replaced with the scene that they belong to.
+    let refined = ["--steps", "5", "--refine-intrinsics"];
+    succeed(&train(&capture, &out, &refined));
+    assert!(cameras.join("cameras.bin").exists());
+    succeed(&train(&capture, &out, &["--steps", "5"]));
+    assert!(!cameras.join("cameras.bin").exists());
     // Undistorted photos are not replaced.
     let again = train(&capture, &out, &flags);
     assert_eq!(again.status.code(), Some(2));

@@ -166,12 +166,15 @@ impl RunFolder<'_> {
         (metrics, self.outcome(saving))
     }
 
-    /// Saves the scene. Figures of an earlier scene are removed.
+    /// Saves the scene. Figures and refined cameras of an earlier scene are removed.
     fn save_scene(&self, saving: &mut Saving, trained: &Trained) -> bool {
         let path = self.folder.join(SCENE);
         let saved = saving.keep(SCENE, ply::write(&path, &trained.to_data()));
         if saved {
             let _ = std::fs::remove_file(self.folder.join(METRICS));
+            for file in ["cameras.bin", "images.bin", "points3D.bin"] {
+                let _ = std::fs::remove_file(self.folder.join(CAMERAS).join(file));
+            }
         }
         saved
     }
