@@ -6,25 +6,13 @@ use std::path::{Path, PathBuf};
 use image::{ImageFormat, RgbImage};
 use tempfile::TempDir;
 
-use super::test_capture::{SIZES, TestCapture};
+use super::test_capture::{SIZES, TestCapture, good, load};
 use super::*;
 
 /// First photo by name, of the size of the first camera.
 const FIRST: &str = "view r.png";
 
 const LOSSY_WEBP: &[u8] = include_bytes!("testdata/lossy.webp");
-
-fn good() -> (TempDir, TestCapture) {
-    let root = TempDir::new().unwrap();
-    let capture = TestCapture::new();
-    capture.write_photos(root.path());
-    capture.write_binary(&root.path().join("sparse/0"));
-    (root, capture)
-}
-
-fn load(root: &Path) -> Result<Capture, CaptureError> {
-    Capture::load(root, &CaptureSettings::default())
-}
 
 fn load_from(root: &Path, images: &Path) -> Result<Capture, CaptureError> {
     let options = CaptureSettings {

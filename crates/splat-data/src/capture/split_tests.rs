@@ -4,21 +4,8 @@ use std::path::Path;
 
 use tempfile::TempDir;
 
-use super::test_capture::TestCapture;
+use super::test_capture::{good, load};
 use super::*;
-
-/// Nine views, from `view r.png` to `view z.png`.
-fn good() -> (TempDir, TestCapture) {
-    let root = TempDir::new().unwrap();
-    let capture = TestCapture::new();
-    capture.write_photos(root.path());
-    capture.write_binary(&root.path().join("sparse/0"));
-    (root, capture)
-}
-
-fn load(root: &Path) -> Result<Capture, CaptureError> {
-    Capture::load(root, &CaptureSettings::default())
-}
 
 fn error_of(root: &Path, file: &str) -> CaptureError {
     let error = load(root).expect_err("the capture is bad");

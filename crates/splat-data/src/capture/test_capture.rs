@@ -4,7 +4,9 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use super::Point;
+use tempfile::TempDir;
+
+use super::{Capture, CaptureError, CaptureSettings, Point};
 
 /// (id, quaternion, translation, camera id, name).
 type Image = (u32, [f64; 4], [f64; 3], u32, String);
@@ -20,6 +22,19 @@ pub(super) struct TestCapture {
 
 /// Size of the two cameras.
 pub(super) const SIZES: [[u32; 2]; 2] = [[32, 24], [24, 30]];
+
+/// A valid binary capture in its own folder: nine views, from `view r.png` to `view z.png`.
+pub(super) fn good() -> (TempDir, TestCapture) {
+    let root = TempDir::new().unwrap();
+    let capture = TestCapture::new();
+    capture.write_photos(root.path());
+    capture.write_binary(&root.path().join("sparse/0"));
+    (root, capture)
+}
+
+pub(super) fn load(root: &Path) -> Result<Capture, CaptureError> {
+    Capture::load(root, &CaptureSettings::default())
+}
 
 impl TestCapture {
     /// Nine images of two cameras (one of each supported model), with ids and names out of order.

@@ -5,21 +5,8 @@ use std::path::{Path, PathBuf};
 
 use tempfile::TempDir;
 
-use super::test_capture::{SIZES, TestCapture};
+use super::test_capture::{SIZES, TestCapture, good, load};
 use super::*;
-
-/// A valid binary capture in its own folder.
-fn good() -> (TempDir, TestCapture) {
-    let root = TempDir::new().unwrap();
-    let capture = TestCapture::new();
-    capture.write_photos(root.path());
-    capture.write_binary(&root.path().join("sparse/0"));
-    (root, capture)
-}
-
-fn load(root: &Path) -> Result<Capture, CaptureError> {
-    Capture::load(root, &CaptureSettings::default())
-}
 
 /// The error of loading `root`, which must be one line and name `file`.
 fn error_of(root: &Path, file: &str) -> CaptureError {
