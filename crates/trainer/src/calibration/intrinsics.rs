@@ -10,11 +10,14 @@ use splat_model::strategy::StepInfo;
 use splat_model::{Camera, CameraModel, CameraTensors, FieldStep, Lens, Optimized};
 use splat_ops::{Distortion, OpError};
 
-use super::CalibrationSettings;
+use super::{CalibrationSchedule, CalibrationSettings};
 use crate::{Hook, HookView};
 
 /// Coefficients of the model with the most.
 const COEFFICIENTS: usize = 8;
+/// A coefficient of a higher power moves so much slower than the one before: within the photo both
+/// bend its corner alike, and what the lower one can explain is left to it.
+const NEXT_POWER: f64 = 0.1;
 /// Steps between two looks at the domains of the lenses.
 const REFRESH: usize = 100;
 /// Name of the domains in a checkpoint, apart from those of parameters.
@@ -26,7 +29,7 @@ struct Corrections {
     focal: Param<Tensor<2>>,
     /// Shifts of cx and cy `[cameras, 2]`, in sides of the photo.
     principal: Param<Tensor<2>>,
-    /// Added to the coefficients `[cameras, 8]`.
+    /// Added to the coefficients `[cameras, 8]`, in units of [`Physical::unit`].
     distortion: Param<Tensor<2>>,
 }
 
@@ -39,9 +42,9 @@ struct Physical {
     model: CameraModel,
     /// Coefficients at the start, filled up with zeros.
     start: [f64; COEFFICIENTS],
-    /// 1 for coefficients that are trained.
-    trained: [f64; COEFFICIENTS],
-    /// Whether fx and fy have one factor.
+    /// What a unit of each coefficient's correction is; 0 for those that are not trained.
+    unit: [f64; COEFFICIENTS],
+    /// Whether fx and fy have one factor, as those of (nearly) square pixels.
     square: bool,
 }
 
@@ -56,18 +59,25 @@ impl Physical {
         start[..lens.coefficients().len()].copy_from_slice(lens.coefficients());
         // The higher coefficients of a perspective lens can hardly be told apart by one capture;
         // those that it has are kept and trained.
-        let trained = std::array::from_fn(|k| {
-            f64::from(u8::from(
-                k < 4 || (k < model.coefficients() && start[k] != 0.0),
-            ))
+        let trained = |k: usize| k < 4 || (k < model.coefficients() && start[k] != 0.0);
+        // Powers of the square of the radius, or the angle, after the first.
+        let power = |k: usize| match (model, k) {
+            (CameraModel::OpenCvFisheye, k) => k,
+            (_, 1 | 6) => 1,
+            (_, 4 | 7) => 2,
+            _ => 0,
+        };
+        let unit = std::array::from_fn(|k| match trained(k) {
+            true => NEXT_POWER.powi(power(k) as i32),
+            false => 0.0,
         });
         let [fx, fy, ..] = camera.intrinsics;
         Self {
             camera: *camera,
             model,
             start,
-            trained,
-            square: (fx / fy - 1.0).abs() < 1e-6,
+            unit,
+            square: (fx / fy - 1.0).abs() < 0.01,
         }
     }
 
@@ -87,7 +97,7 @@ impl Physical {
             c.focal
         };
         let k: Vec<f64> = (0..self.model.coefficients())
-            .map(|k| self.start[k] + self.trained[k] * c.distortion[k])
+            .map(|k| self.start[k] + self.unit[k] * c.distortion[k])
             .collect();
         Camera {
             intrinsics: [
@@ -123,6 +133,7 @@ pub struct RefineIntrinsics {
     /// Limit and clamp of each lens.
     domains: Vec<[f64; 2]>,
     settings: CalibrationSettings,
+    schedule: CalibrationSchedule,
 }
 
 impl RefineIntrinsics {
@@ -133,6 +144,7 @@ impl RefineIntrinsics {
     pub fn new(
         views: &[View],
         settings: CalibrationSettings,
+        schedule: CalibrationSchedule,
         device: &Device,
     ) -> Result<Self, OpError> {
         let mut cameras: Vec<Physical> = Vec::new();
@@ -161,6 +173,7 @@ impl RefineIntrinsics {
             cameras,
             of_view,
             settings,
+            schedule,
         };
         refined.refresh()?;
         Ok(refined)
@@ -247,8 +260,8 @@ impl Hook for RefineIntrinsics {
 
         let k = physical.model.coefficients();
         let change = of_camera(&corrections.distortion).narrow(1, 0, k);
-        let trained = row(&physical.trained[..k], &change);
-        let coefficients = row(&physical.start[..k], &change) + change * trained;
+        let unit = row(&physical.unit[..k], &change);
+        let coefficients = row(&physical.start[..k], &change) + change * unit;
         cameras.distortion = Some(Distortion {
             model: physical.model,
             domain: row(&self.domains[index], &coefficients),
@@ -258,16 +271,18 @@ impl Hook for RefineIntrinsics {
     }
 
     fn step(&mut self, gradients: &mut Gradients, at: &StepInfo) -> Result<(), OpError> {
+        let Some(factor) = self.schedule.factor(at.step) else {
+            return Ok(());
+        };
         let gradients = self.corrections.gradients(gradients);
         let settings = &self.settings;
-        let decay = settings.decay(at.step, at.run.steps);
         self.corrections.step(gradients, |field| {
             let rate = match field.name.as_str() {
                 "focal" => settings.focal_rate,
                 "principal" => settings.principal_rate,
                 _ => settings.distortion_rate,
             };
-            (rate * decay, FieldStep::Step(1.0))
+            (rate * factor, FieldStep::Step(1.0))
         })?;
         if at.step % REFRESH == REFRESH - 1 {
             self.refresh()?;

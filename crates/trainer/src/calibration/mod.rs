@@ -9,10 +9,12 @@ mod align;
 mod intrinsics;
 mod motion;
 mod poses;
+mod schedule;
 mod settings;
 
 pub(crate) use align::Aligning;
 pub use align::{AlignedScores, align_pose};
 pub use intrinsics::RefineIntrinsics;
 pub use poses::RefinePoses;
+pub use schedule::CalibrationSchedule;
 pub use settings::CalibrationSettings;

@@ -1,9 +1,15 @@
 //! Rigid motions of a camera, smooth at no motion, as tensors and on the host.
 //!
 //! A motion of six numbers turns by the rotation vector (r1, r2, r3), in radians for small angles,
-//! and then shifts by `length` times the rest, both in the axes of the camera. With u = r / 2 and K
-//! the matrix of the cross product with u, the rotation is Cayley's: `I + 2 (K + K^2) / (1 +
-//! |u|^2)`. It is a rotation exactly, for any r, and needs no sine.
+//! about the point at `length` in front of the camera, and then shifts by `length` times the rest,
+//! both in the axes of the camera. With u = r / 2 and K the matrix of the cross product with u, the
+//! rotation is Cayley's: `I + 2 (K + K^2) / (1 + |u|^2)`. It is a rotation exactly, for any r, and
+//! needs no sine.
+//!
+//! About its own centre, a turn of the camera moves the picture as a step to the side does, and
+//! what tells them apart, the depths, is a small part of both: an optimiser that scales each number
+//! by itself would settle where one stands in for the other. About a point in the scene, a turn
+//! leaves the middle of the picture in place.
 
 use burn::tensor::Tensor;
 use glam::{DMat3, DMat4, DVec3};
@@ -29,7 +35,11 @@ pub(super) fn moved(viewmats: Tensor<3>, motion: Tensor<2>, length: f64) -> Tens
     let turn = (cross.clone() + cross.clone().matmul(cross)) * 2.0;
     let turn = turn / square.reshape([1, 1, 1]).repeat_dim(1, 3).repeat_dim(2, 3);
     let turn = turn + Tensor::<2>::eye(3, &device).unsqueeze();
-    let rows = Tensor::cat(vec![turn, shift.reshape([1, 3, 1])], 2); // [1, 3, 4]
+    // The point p in front comes back to where it was: p - R p.
+    let front = Tensor::<3>::from_floats([[[0.0], [0.0], [1.0]]], &device);
+    let back = (front - turn.clone().narrow(2, 2, 1)) * length;
+    let shift = shift.reshape([1, 3, 1]) + back;
+    let rows = Tensor::cat(vec![turn, shift], 2); // [1, 3, 4]
     let last = Tensor::<3>::from_floats([[[0.0, 0.0, 0.0, 1.0]]], &device);
     Tensor::cat(vec![rows, last], 1).matmul(viewmats)
 }
@@ -43,7 +53,8 @@ pub(super) fn moved_f64(viewmat: DMat4, motion: [f64; MOTION], length: f64) -> D
     // `u x e_i` as columns is the matrix of `u x`.
     let turn = DMat3::IDENTITY + (cross + cross * cross) * (2.0 / (1.0 + u.length_squared()));
     let mut rigid = DMat4::from_mat3(turn);
-    rigid.w_axis = (DVec3::new(s1, s2, s3) * length).extend(1.0);
+    let back = DVec3::Z - turn.z_axis;
+    rigid.w_axis = ((DVec3::new(s1, s2, s3) + back) * length).extend(1.0);
     rigid * viewmat
 }
 

@@ -7,8 +7,8 @@ use splat_model::strategy::StepInfo;
 use splat_model::{Camera, CameraTensors, FieldStep, Optimized, SceneScale};
 use splat_ops::OpError;
 
-use super::CalibrationSettings;
 use super::motion::{MOTION, moved, moved_f64};
+use super::{CalibrationSchedule, CalibrationSettings};
 use crate::{Hook, HookView};
 
 #[derive(Module, Debug)]
@@ -25,7 +25,8 @@ struct Motions {
 /// [`align_pose`](super::align_pose).
 pub struct RefinePoses {
     motions: Optimized<Motions>,
-    settings: CalibrationSettings,
+    rate: f64,
+    schedule: CalibrationSchedule,
     scene: SceneScale,
 }
 
@@ -37,7 +38,8 @@ impl RefinePoses {
     pub fn new(
         views: usize,
         scene: SceneScale,
-        settings: CalibrationSettings,
+        settings: &CalibrationSettings,
+        schedule: CalibrationSchedule,
         device: &Device,
     ) -> Result<Self, OpError> {
         let device = device.clone().without_autodiff().autodiff();
@@ -47,7 +49,8 @@ impl RefinePoses {
         let rate = settings.pose_rate;
         Ok(Self {
             motions: Optimized::of_module(motions, rate, |_| SplatAdam::new().into())?,
-            settings,
+            rate,
+            schedule,
             scene,
         })
     }
@@ -86,10 +89,12 @@ impl Hook for RefinePoses {
     }
 
     fn step(&mut self, gradients: &mut Gradients, at: &StepInfo) -> Result<(), OpError> {
+        let Some(factor) = self.schedule.factor(at.step) else {
+            return Ok(());
+        };
         let gradients = self.motions.gradients(gradients);
-        let rate = self.settings.pose_rate * self.settings.decay(at.step, at.run.steps);
         self.motions
-            .step(gradients, |_| (rate, FieldStep::Step(1.0)))
+            .step(gradients, |_| (self.rate * factor, FieldStep::Step(1.0)))
     }
 
     fn save(&self) -> Result<StateRecord, OpError> {

@@ -20,11 +20,16 @@ pub struct CalibrationSettings {
     /// Rate of poses: radians for rotations, sizes of the scene for translations. Default 1e-3;
     /// gsplat has 1e-5, which corrects a fraction of a degree in its 30,000 steps.
     pub pose_rate: f64,
+    /// Cameras are refined after so many passes over the photos, or an eighth of the run where that
+    /// is shorter. Before, the first Gaussians leave holes, and cameras would move to where the
+    /// picture is fuller. Default 10.
+    pub start_passes: usize,
     /// Rate of the logarithms of focal lengths. Default 1e-3.
     pub focal_rate: f64,
     /// Rate of principal points, in sides of the photo. Default 3e-4.
     pub principal_rate: f64,
-    /// Rate of distortion coefficients. Default 2e-3.
+    /// Rate of the first distortion coefficients; those of higher powers of the radius follow at a
+    /// tenth of it for each power. Default 2e-3.
     pub distortion_rate: f64,
     /// All rates fall exponentially to this share of themselves at the end of the run. Default
     /// 0.01 (gsplat).
@@ -43,11 +48,6 @@ impl CalibrationSettings {
     /// True if anything is refined.
     pub fn is_on(&self) -> bool {
         self.poses || self.intrinsics
-    }
-
-    /// The factor of all rates at a step.
-    pub(crate) fn decay(&self, step: usize, steps: usize) -> f64 {
-        self.final_share.powf(step as f64 / steps.max(1) as f64)
     }
 
     /// Checks that the settings can be used.
@@ -79,6 +79,7 @@ impl Default for CalibrationSettings {
             poses: false,
             intrinsics: false,
             pose_rate: 1e-3,
+            start_passes: 10,
             focal_rate: 1e-3,
             principal_rate: 3e-4,
             distortion_rate: 2e-3,

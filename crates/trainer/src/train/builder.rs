@@ -302,14 +302,15 @@ fn calibration(
     device: &Device,
 ) -> Result<Vec<Box<dyn Hook>>, TrainError> {
     let settings = &config.calibration;
+    let schedule = config.calibration_schedule(capture);
     let mut hooks: Vec<Box<dyn Hook>> = Vec::new();
     if settings.intrinsics {
-        let hook = RefineIntrinsics::new(&capture.views, settings.clone(), device)?;
+        let hook = RefineIntrinsics::new(&capture.views, settings.clone(), schedule, device)?;
         hooks.push(Box::new(hook));
     }
     if settings.poses {
         let views = capture.split.train.len();
-        let hook = RefinePoses::new(views, scene, settings.clone(), device)?;
+        let hook = RefinePoses::new(views, scene, settings, schedule, device)?;
         hooks.push(Box::new(hook));
     }
     Ok(hooks)

@@ -8,9 +8,10 @@ use splat_model::ops::{AdamRows, ClampGradient, RasterizeSettings};
 use splat_model::strategy::{AdcSettings, McmcSettings};
 use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale};
 
+use splat_data::Capture;
 use splat_data::text::{one_line, utf8};
 
-use crate::calibration::CalibrationSettings;
+use crate::calibration::{CalibrationSchedule, CalibrationSettings};
 
 /// Larger files are refused: parsing one could exhaust memory.
 const LONGEST: usize = 1 << 20;
@@ -199,6 +200,12 @@ impl TrainSettings {
             },
             project: scene.project_settings(),
         }
+    }
+
+    /// When the cameras of a capture are refined.
+    pub(crate) fn calibration_schedule(&self, capture: &Capture) -> CalibrationSchedule {
+        let views = capture.split.train.len();
+        (self.calibration).schedule(self.steps, views, self.views_per_step)
     }
 
     /// Which Gaussians the optimiser steps.
