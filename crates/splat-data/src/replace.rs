@@ -1,6 +1,7 @@
 //! Atomic file replacement, and checks that a path is writable before long work.
 
-use std::io::{Error, ErrorKind, Write};
+use std::fs::File;
+use std::io::{BufWriter, Error, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 /// Why a file or folder cannot be written.
@@ -36,12 +37,34 @@ pub fn write_durably(path: &Path, contents: &[u8]) -> std::io::Result<()> {
     replace(path, contents, true)
 }
 
+/// [`write_durably`] for contents that `write` produces piece by piece. An error of `write` leaves
+/// an existing file untouched.
+pub(crate) fn write_durably_with<E>(
+    path: &Path,
+    io_error: impl Fn(Error) -> E,
+    write: impl FnOnce(&mut BufWriter<&File>) -> Result<(), E>,
+) -> Result<(), E> {
+    replace_with(path, true, &io_error, write)
+}
+
 fn replace(path: &Path, contents: &[u8], durably: bool) -> std::io::Result<()> {
+    replace_with(path, durably, &|error| error, |out| out.write_all(contents))
+}
+
+fn replace_with<E>(
+    path: &Path,
+    durably: bool,
+    io_error: &impl Fn(Error) -> E,
+    write: impl FnOnce(&mut BufWriter<&File>) -> Result<(), E>,
+) -> Result<(), E> {
+    let written = |file: &File| {
+        let mut out = BufWriter::with_capacity(1 << 20, file);
+        write(&mut out)?;
+        out.flush().map_err(io_error)
+    };
     if is_device(path) {
-        return std::fs::OpenOptions::new()
-            .write(true)
-            .open(path)?
-            .write_all(contents);
+        let file = File::options().write(true).open(path).map_err(io_error)?;
+        return written(&file);
     }
     // The target of a link, not the link itself.
     let linked = path
@@ -50,14 +73,14 @@ fn replace(path: &Path, contents: &[u8], durably: bool) -> std::io::Result<()> {
         .flatten();
     let path = linked.as_deref().unwrap_or(path);
     let folder = folder_of(path);
-    std::fs::create_dir_all(folder)?;
+    std::fs::create_dir_all(folder).map_err(io_error)?;
     // On the same file system as the target, so that the rename is one step.
-    let file = temporary_file(folder)?;
-    file.as_file().write_all(contents)?;
+    let file = temporary_file(folder).map_err(io_error)?;
+    written(file.as_file())?;
     if durably {
-        file.as_file().sync_all()?;
+        file.as_file().sync_all().map_err(io_error)?;
     }
-    file.persist(path)?;
+    file.persist(path).map_err(|error| io_error(error.error))?;
     if durably {
         sync_folder(folder);
     }

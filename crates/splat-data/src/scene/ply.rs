@@ -26,7 +26,7 @@ mod rows;
 
 use std::cell::Cell;
 use std::fs::File;
-use std::io::{BufRead, BufReader, BufWriter, Write};
+use std::io::{BufRead, BufReader};
 use std::path::Path;
 
 use ply_rs_bw::parser::Parser;
@@ -37,6 +37,7 @@ use ply_rs_bw::ply::{
 use ply_rs_bw::writer::Writer;
 
 use super::{SceneFileError, SceneFormat, SplatData};
+use crate::replace::write_durably_with;
 use columns::{Columns, may_be};
 pub(crate) use points::parse_points;
 use rows::{FileRow, Rows};
@@ -67,22 +68,6 @@ pub fn write(path: impl AsRef<Path>, scene: &SplatData) -> Result<(), SceneFileE
         path: path.to_path_buf(),
         source,
     };
-    // The target of a link, not the link itself.
-    let target = path
-        .is_symlink()
-        .then(|| path.canonicalize().ok())
-        .flatten();
-    let target = target.as_deref().unwrap_or(path);
-    let folder = match target.parent() {
-        Some(folder) if !folder.as_os_str().is_empty() => folder,
-        _ => Path::new("."),
-    };
-    let mut file = tempfile::Builder::new();
-    readable_by_all(&mut file);
-    let file = file
-        .tempfile_in(folder)
-        .map_err(|error| io_error(without_temporary_name(error)))?;
-
     let mut header = Header::new();
     header.encoding = Encoding::BinaryLittleEndian;
     let mut vertex = ElementDef::new("vertex".to_owned());
@@ -96,30 +81,27 @@ pub fn write(path: impl AsRef<Path>, scene: &SplatData) -> Result<(), SceneFileE
     let vertex = &header.elements["vertex"];
 
     let writer = Writer::<Row>::new();
-    let mut out = BufWriter::with_capacity(1 << 20, file.as_file());
-    writer.write_header(&mut out, &header).map_err(io_error)?;
-    let mut row = Row::new();
-    for index in 0..scene.len() {
-        row.fill(scene, index);
-        let bad = |(at, value): (usize, &f32)| !value.is_finite() && !may_be(&names[at], *value);
-        if let Some(at) = row.values.iter().enumerate().position(bad) {
-            return Err(SceneFileError::NotFinite {
-                path: path.to_path_buf(),
-                index,
-                property: names[at].clone(),
-                value: row.values[at],
-            });
+    write_durably_with(path, io_error, |out| {
+        writer.write_header(out, &header).map_err(io_error)?;
+        let mut row = Row::new();
+        for index in 0..scene.len() {
+            row.fill(scene, index);
+            let bad =
+                |(at, value): (usize, &f32)| !value.is_finite() && !may_be(&names[at], *value);
+            if let Some(at) = row.values.iter().enumerate().position(bad) {
+                return Err(SceneFileError::NotFinite {
+                    path: path.to_path_buf(),
+                    index,
+                    property: names[at].clone(),
+                    value: row.values[at],
+                });
+            }
+            writer
+                .write_little_endian_element(out, &row, vertex)
+                .map_err(io_error)?;
         }
-        writer
-            .write_little_endian_element(&mut out, &row, vertex)
-            .map_err(io_error)?;
-    }
-    out.flush().map_err(io_error)?;
-    drop(out);
-    file.as_file().sync_all().map_err(io_error)?;
-    file.persist(target)
-        .map_err(|error| io_error(error.error))?;
-    Ok(())
+        Ok(())
+    })
 }
 
 /// Reads the scene in the file `path`.
@@ -269,26 +251,6 @@ impl FileRow for Row {
         self.values.push(f32::NAN);
     }
 }
-
-/// The error without the random name of the temporary file, which means nothing to the user.
-fn without_temporary_name(error: std::io::Error) -> std::io::Error {
-    let text = error.to_string();
-    match text.split_once(" at path \"") {
-        Some((reason, _)) => std::io::Error::new(error.kind(), reason.to_owned()),
-        None => error,
-    }
-}
-
-/// Temporary files are private by default; the file that replaces the old one should not be.
-#[cfg(unix)]
-fn readable_by_all(builder: &mut tempfile::Builder<'_, '_>) {
-    use std::os::unix::fs::PermissionsExt;
-    // The umask of the process still applies.
-    builder.permissions(std::fs::Permissions::from_mode(0o666));
-}
-
-#[cfg(not(unix))]
-fn readable_by_all(_: &mut tempfile::Builder<'_, '_>) {}
 
 #[cfg(test)]
 mod tests;
