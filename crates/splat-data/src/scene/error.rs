@@ -15,7 +15,7 @@ pub enum SceneFileError {
         /// The system's error.
         source: std::io::Error,
     },
-    /// The header is not that of a PLY file of splats.
+    /// The header is not that of a scene.
     #[error("{}: {reason}", path.display())]
     Header {
         /// The file.
@@ -81,12 +81,22 @@ pub enum SceneFileError {
         /// The value.
         value: f32,
     },
-    /// A scene setting that no reader would accept.
+    /// An array or entry of a file is malformed, or a scene's array does not fit a format.
+    #[error("{}: {field}: {reason}", path.display())]
+    Field {
+        /// The file.
+        path: PathBuf,
+        /// The array or entry.
+        field: &'static str,
+        /// The reason.
+        reason: String,
+    },
+    /// A setting of the scene or its writer that is out of range.
     #[error("{}: {setting} is {value}; it must be {must_be}", path.display())]
     Setting {
         /// The file.
         path: PathBuf,
-        /// Name of the setting in [`SceneSettings`](super::SceneSettings).
+        /// Name of the setting in [`SceneSettings`](super::SceneSettings) or in those of a writer.
         setting: &'static str,
         /// The value.
         value: String,

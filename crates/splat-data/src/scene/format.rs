@@ -16,4 +16,7 @@ pub struct SceneFormat {
     pub read: fn(&Path) -> Result<SplatData, SceneFileError>,
     /// Writes a file atomically.
     pub write: fn(&Path, &SplatData) -> Result<(), SceneFileError>,
+    /// What a file in this format cannot hold of a scene, beyond precision; one line each, for a
+    /// warning.
+    pub losses: fn(&SplatData) -> Vec<String>,
 }

@@ -5,10 +5,10 @@ use std::io::Read;
 use std::path::Path;
 
 use super::format::SceneFormat;
-use super::{SceneFileError, SplatData, ply};
+use super::{SceneFileError, SplatData, ply, spz};
 
 /// All formats.
-pub const FORMATS: &[SceneFormat] = &[ply::FORMAT];
+pub const FORMATS: &[SceneFormat] = &[ply::FORMAT, spz::FORMAT];
 
 /// Number of bytes used to recognise a format.
 const HEAD: u64 = 64;
@@ -83,6 +83,12 @@ mod tests {
             write(&path, &scene).unwrap();
             assert_eq!(read(&path).unwrap(), scene, "{name}");
         }
+        // Compressed files are known by their bytes, whatever their name.
+        let path = folder.path().join("scene.spz");
+        write(&path, &scene).unwrap();
+        let renamed = folder.path().join("renamed.ply");
+        std::fs::rename(path, &renamed).unwrap();
+        assert_eq!(read(&renamed).unwrap().means, scene.means);
         let other = write(folder.path().join("scene.splat"), &scene);
         let other = other.unwrap_err().to_string();
         assert!(

@@ -49,6 +49,7 @@ pub(super) const FORMAT: SceneFormat = SceneFormat {
     is: |head| head.trim_ascii_start().starts_with(b"ply"),
     read: |path| read(path),
     write: |path, scene| write(path, scene),
+    losses: |_| vec![],
 };
 
 /// Writes `scene` to `path` atomically: to a temporary file beside it, which is then renamed. The
