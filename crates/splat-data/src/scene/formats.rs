@@ -5,10 +5,10 @@ use std::io::Read;
 use std::path::Path;
 
 use super::format::SceneFormat;
-use super::{SceneFileError, SplatData, ply, spz};
+use super::{SceneFileError, SplatData, ply, sog, spz};
 
 /// All formats.
-pub const FORMATS: &[SceneFormat] = &[ply::FORMAT, spz::FORMAT];
+pub const FORMATS: &[SceneFormat] = &[ply::FORMAT, spz::FORMAT, sog::FORMAT];
 
 /// Number of bytes used to recognise a format.
 const HEAD: u64 = 64;
@@ -38,22 +38,30 @@ pub fn read(path: impl AsRef<Path>) -> Result<SplatData, SceneFileError> {
 /// [`SceneFileError`] if the extension is unknown or the scene cannot be written.
 pub fn write(path: impl AsRef<Path>, scene: &SplatData) -> Result<(), SceneFileError> {
     let path = path.as_ref();
-    let format = match (of_name(path), path.extension()) {
-        (Some(format), _) => format,
-        (None, None) => &FORMATS[0],
+    (format_to_write(path)?.write)(path, scene)
+}
+
+/// The format in which [`write()`] writes a file of this name.
+///
+/// # Errors
+/// [`SceneFileError::Header`] if the extension is unknown.
+pub fn format_to_write(path: impl AsRef<Path>) -> Result<&'static SceneFormat, SceneFileError> {
+    let path = path.as_ref();
+    match (of_name(path), path.extension()) {
+        (Some(format), _) => Ok(format),
+        (None, None) => Ok(&FORMATS[0]),
         (None, Some(_)) => {
             let endings = FORMATS.iter().flat_map(|format| format.endings);
             let endings: Vec<String> = endings.map(|ending| format!(".{ending}")).collect();
-            return Err(SceneFileError::Header {
+            Err(SceneFileError::Header {
                 path: path.to_path_buf(),
                 reason: format!(
                     "no format of that name is known; name it {}",
                     endings.join(", ")
                 ),
-            });
+            })
         }
-    };
-    (format.write)(path, scene)
+    }
 }
 
 fn of_name(path: &Path) -> Option<&'static SceneFormat> {
@@ -84,11 +92,13 @@ mod tests {
             assert_eq!(read(&path).unwrap(), scene, "{name}");
         }
         // Compressed files are known by their bytes, whatever their name.
-        let path = folder.path().join("scene.spz");
-        write(&path, &scene).unwrap();
-        let renamed = folder.path().join("renamed.ply");
-        std::fs::rename(path, &renamed).unwrap();
-        assert_eq!(read(&renamed).unwrap().means, scene.means);
+        for name in ["scene.spz", "scene.sog"] {
+            let path = folder.path().join(name);
+            write(&path, &scene).unwrap();
+            let renamed = folder.path().join("renamed.ply");
+            std::fs::rename(path, &renamed).unwrap();
+            assert_eq!(read(&renamed).unwrap().means, scene.means, "{name}");
+        }
         let other = write(folder.path().join("scene.splat"), &scene);
         let other = other.unwrap_err().to_string();
         assert!(

@@ -1,7 +1,7 @@
 //! Scene files: trained splats as plain data ([`SplatData`]), without tensors.
 //!
 //! [`read()`] and [`write()`] recognise the format by the file: [`ply`] is the layout of the 3DGS
-//! paper's code, exact and read by every viewer, [`spz`] a tenth of its size.
+//! paper's code, exact and read by every viewer, [`spz`] a tenth of its size, [`sog`] a fifteenth.
 //!
 //! ```
 //! use splat_data::{SplatData, scene};
@@ -22,6 +22,7 @@
 //! ```
 
 pub mod ply;
+pub mod sog;
 pub mod spz;
 
 mod axes;
@@ -35,7 +36,7 @@ mod values;
 
 pub use error::SceneFileError;
 pub use format::SceneFormat;
-pub use formats::{FORMATS, read, write};
+pub use formats::{FORMATS, format_to_write, read, write};
 
 use crate::SceneScale;
 

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use super::{SceneFileError, SplatData};
+use crate::SceneScale;
 
 /// Checks that every value has a meaning: opacity logits may be infinite, log-scales minus infinity
 /// (a flat Gaussian), everything else is finite. Properties are named as in a PLY file.
@@ -13,14 +14,7 @@ pub(super) fn check(path: &Path, scene: &SplatData) -> Result<(), SceneFileError
             path: path.to_path_buf(),
         });
     }
-    if scene.origin.iter().any(|value| !value.is_finite()) {
-        return Err(SceneFileError::Setting {
-            path: path.to_path_buf(),
-            setting: "origin",
-            value: format!("{:?}", scene.origin),
-            must_be: "finite",
-        });
-    }
+    check_settings(path, scene)?;
     let bad = |index, property: String, value| {
         Err(SceneFileError::NotFinite {
             path: path.to_path_buf(),
@@ -59,6 +53,33 @@ pub(super) fn check(path: &Path, scene: &SplatData) -> Result<(), SceneFileError
         }
     }
     Ok(())
+}
+
+/// Checks that the origin and the settings of a scene are numbers that every reader accepts.
+pub(super) fn check_settings(path: &Path, scene: &SplatData) -> Result<(), SceneFileError> {
+    let bad = |setting, value: &dyn std::fmt::Debug, must_be| SceneFileError::Setting {
+        path: path.to_path_buf(),
+        setting,
+        value: format!("{value:?}"),
+        must_be,
+    };
+    let settings = &scene.settings;
+    if !scene.origin.iter().all(|value| value.is_finite()) {
+        return Err(bad("origin", &scene.origin, "finite"));
+    }
+    if let Some(scale) = settings.scene_scale.filter(|scale| !is_scale(*scale)) {
+        return Err(bad("scene_scale", &scale, "from 1e-15 to 1e10"));
+    }
+    let finite = |color: &[f32; 3]| color.iter().all(|value| value.is_finite());
+    match settings.background.filter(|color| !finite(color)) {
+        Some(color) => Err(bad("background", &color, "finite")),
+        None => Ok(()),
+    }
+}
+
+/// True for a possible size of a scene.
+pub(super) fn is_scale(scale: f64) -> bool {
+    SceneScale::new(scale).is_some_and(SceneScale::is_in_range)
 }
 
 /// Opacity of a Gaussian; 0 for one that is never drawn because its quaternion is 0 or its scale

@@ -19,33 +19,22 @@
 use std::path::Path;
 use std::str::FromStr;
 
+use super::super::values::{check_settings, is_scale};
 use super::super::{SceneFileError, SceneSettings, SplatData};
-use crate::SceneScale;
 
 /// First word of our comments.
 const OURS: &str = "burn-splat";
 
 /// Comments of a scene, without the word `comment`.
 pub(super) fn write(path: &Path, scene: &SplatData) -> Result<Vec<String>, SceneFileError> {
-    let bad = |setting, value: &dyn std::fmt::Debug, must_be| SceneFileError::Setting {
-        path: path.to_path_buf(),
-        setting,
-        value: format!("{value:?}"),
-        must_be,
-    };
+    check_settings(path, scene)?;
     let mut comments = Vec::new();
     let [x, y, z] = scene.origin;
-    if scene.origin.iter().any(|value| !value.is_finite()) {
-        return Err(bad("origin", &scene.origin, "finite"));
-    }
     if scene.origin != [0.0; 3] {
         comments.push(format!("{OURS} origin {x} {y} {z}"));
     }
     let settings = &scene.settings;
     if let Some(scale) = settings.scene_scale {
-        if !is_scale(scale) {
-            return Err(bad("scene_scale", &scale, "from 1e-15 to 1e10"));
-        }
         comments.push(format!("{OURS} scene_scale {scale:e}"));
     }
     if let Some(antialias) = settings.antialias {
@@ -56,9 +45,6 @@ pub(super) fn write(path: &Path, scene: &SplatData) -> Result<Vec<String>, Scene
         comments.push(format!("antialiased {bit}"));
     }
     if let Some([r, g, b]) = settings.background {
-        if ![r, g, b].into_iter().all(f32::is_finite) {
-            return Err(bad("background", &[r, g, b], "finite"));
-        }
         comments.push(format!("{OURS} background {r} {g} {b}"));
     }
     Ok(comments)
@@ -189,8 +175,4 @@ fn bit(words: &[&str]) -> Option<bool> {
         ["1"] => Some(true),
         _ => None,
     }
-}
-
-fn is_scale(scale: f64) -> bool {
-    SceneScale::new(scale).is_some_and(SceneScale::is_in_range)
 }

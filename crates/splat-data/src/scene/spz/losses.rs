@@ -14,7 +14,9 @@ pub(super) fn losses(scene: &SplatData) -> Vec<String> {
     if let Some(scale) = settings.scene_scale {
         losses.push(format!("the scene scale {scale} is left out"));
     }
-    if let Some([r, g, b]) = settings.background {
+    // Without a background, scenes are drawn on black.
+    let background = settings.background.filter(|color| *color != [0.0; 3]);
+    if let Some([r, g, b]) = background {
         losses.push(format!("the background {r} {g} {b} is left out"));
     }
     if scene.origin != [0.0; 3] {

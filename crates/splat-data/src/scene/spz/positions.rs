@@ -123,7 +123,8 @@ pub(super) fn decode(
     bytes: &[u8],
     flip: AxisFlip,
 ) -> Result<Vec<[f32; 3]>, SceneFileError> {
-    let flipped = |position| flip.position(position).map(|value| value as f32);
+    // Without minus zero.
+    let flipped = |position| flip.position(position).map(|value| value as f32 + 0.0);
     if header.version > 1 {
         let step = 1.0 / power(header.fractional_bits);
         let fixed = |b: &[u8]| {
