@@ -21,7 +21,7 @@ use splat_trainer::{Scores, evaluate};
 pub struct EvalArgs {
     /// Capture: a folder with `images/` and `sparse/0/`
     pub capture: PathBuf,
-    /// Scene: a PLY file in the 3DGS layout
+    /// Scene: a PLY file in the 3DGS layout, SPZ or SOG
     pub scene: PathBuf,
     /// Precision of the higher degrees of spherical harmonics
     #[arg(long, value_enum, default_value_t)]

@@ -18,7 +18,7 @@ use splat_data::Capture;
   splat info out/saharov/scene.ply
   splat info examples/data/saharov")]
 pub struct InfoArgs {
-    /// A scene file (PLY) or a capture folder
+    /// A scene file (PLY, SPZ or SOG) or a capture folder
     #[arg(value_name = "SCENE|CAPTURE")]
     pub path: PathBuf,
     #[command(flatten)]

@@ -3,6 +3,7 @@
 #[cfg(feature = "cpu")]
 mod bench;
 mod command_line;
+mod convert;
 mod device;
 mod eval;
 mod failure;
@@ -29,7 +30,7 @@ pub use device::DeviceChoice;
 pub use failure::Failure;
 pub use gradcheck::{GradcheckArgs, Precision};
 
-/// Train, render and inspect Gaussian splats.
+/// Train, render, inspect and convert Gaussian splats.
 #[derive(Debug, Parser)]
 #[command(name = "splat", version, about, long_about = None)]
 #[command(after_help = "Exit status: 0 done, 1 a check failed, 2 bad input.")]
@@ -60,6 +61,7 @@ enum Command {
     Eval(eval::EvalArgs),
     Render(render::RenderArgs),
     Info(info::InfoArgs),
+    Convert(convert::ConvertArgs),
     Gradcheck(GradcheckArgs),
     #[cfg(feature = "cpu")]
     Bench(bench::BenchArgs),
@@ -74,6 +76,7 @@ pub fn main() -> ExitCode {
         Command::Eval(args) => eval::run(args, global),
         Command::Render(args) => render::run(args, global),
         Command::Info(args) => info::run(args, global),
+        Command::Convert(args) => convert::run(args, global),
         Command::Gradcheck(args) => gradcheck::run(args, global),
         #[cfg(feature = "cpu")]
         Command::Bench(args) => bench::run(args, global),

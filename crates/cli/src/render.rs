@@ -31,7 +31,7 @@ A lens: \"camera_model\": \"opencv\", \"distortion\": [k1, k2, p1, p2, k3, k4, k
      or \"camera_model\": \"opencv_fisheye\", \"distortion\": [k1, k2, k3, k4]
 viewmat maps world to camera (+x right, +y down, +z forward); the first pixel's centre is at (0.5, 0.5).")]
 pub struct RenderArgs {
-    /// Scene: a PLY file in the 3DGS layout
+    /// Scene: a PLY file in the 3DGS layout, SPZ or SOG
     pub scene: PathBuf,
     /// Precision of the higher degrees of spherical harmonics
     #[arg(long, value_enum, default_value_t)]

@@ -30,9 +30,9 @@ pub(super) fn open(
     global: &GlobalArgs,
 ) -> Result<(Gaussians, RenderSettings), Failure> {
     let mut data = splat_data::scene::read(path)?;
-    for comment in &data.settings.not_understood {
+    for what in &data.settings.not_understood {
         global.say(format_args!(
-            "warning: {}: not followed: comment `{comment}`",
+            "warning: {}: not followed: `{what}`",
             path.display()
         ));
     }

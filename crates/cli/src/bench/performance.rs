@@ -30,7 +30,7 @@ pub(super) struct PerformanceArgs {
     capture: Option<PathBuf>,
     #[command(flatten)]
     input: CaptureArgs,
-    /// Scene whose lists the rasteriser works on: a PLY file [default: the capture's initial
+    /// Scene whose lists the rasteriser works on: a scene file [default: the capture's initial
     /// Gaussians]
     #[arg(long, value_name = "FILE")]
     scene: Option<PathBuf>,

@@ -87,9 +87,9 @@ fn warnings(scene: &SplatData, opacities: impl Iterator<Item = f64>) -> Vec<Stri
     ];
     let counted = counted.into_iter().filter(|(count, _)| *count > 0);
     let counted = counted.map(|(count, what)| format!("{count} Gaussian(s) {what}"));
-    let comments = scene.settings.not_understood.iter();
-    let comments = comments.map(|comment| format!("not followed: comment `{comment}`"));
-    counted.chain(comments).collect()
+    let foreign = scene.settings.not_understood.iter();
+    let foreign = foreign.map(|what| format!("not followed: `{what}`"));
+    counted.chain(foreign).collect()
 }
 
 /// Range of each axis without its lowest and highest hundredth, which are far outliers in most
@@ -155,7 +155,7 @@ mod tests {
             "scene scale  2.5",
             "anti-aliasing  on",
             "background  0 0.5 1",
-            "warning: not followed: comment `SplatRenderMode: 2dgs`",
+            "warning: not followed: `SplatRenderMode: 2dgs`",
             "  y  -1.0000 to 1.0000",
             "warning: 1 Gaussian(s) have an opacity below 1/255",
             "warning: 1 Gaussian(s) have the quaternion 0",
