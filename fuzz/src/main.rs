@@ -11,7 +11,8 @@ use splat_fuzz::{Campaign, Failed, Report, TARGETS, Target};
 /// Fuzz the file readers
 #[derive(Debug, Parser)]
 struct Args {
-    /// Readers: colmap_binary, colmap_text, ply, fixture, checkpoint, config, gaussians; all
+    /// Readers: colmap_binary, colmap_text, transforms, ply, points, spz, sog, fixture, checkpoint,
+    /// config, gaussians; all
     #[arg(required = true)]
     parsers: Vec<String>,
     /// Processor time for each, in seconds

@@ -44,6 +44,16 @@ fn ply() {
 }
 
 #[test]
+fn spz() {
+    runs("spz", 60_000);
+}
+
+#[test]
+fn sog() {
+    runs("sog", 30_000);
+}
+
+#[test]
 fn fixture() {
     runs("fixture", 60_000);
 }

@@ -10,6 +10,8 @@ mod gaussians;
 mod ply;
 mod points;
 mod safetensors;
+mod sog;
+mod spz;
 mod transforms;
 
 use std::sync::{Arc, LazyLock};
@@ -63,15 +65,19 @@ pub struct Memory {
 /// | COLMAP, binary or text | 16 | 8 KiB |
 /// | transforms.json | 128 | 8 KiB |
 /// | PLY, of splats or points | 32 | 520 KiB, of which 512 are what the PLY library makes room for before it reads a list |
+/// | SPZ | 700 | 20 MiB, as a file of any size may hold 65,536 Gaussians |
+/// | SOG | 800 | 40 MiB, likewise, and its images |
 /// | gradient fixture | 16 | 8 KiB |
 /// | checkpoint | 32 | 8 KiB |
 /// | Gaussians as burnpack | 32 | 2,056 KiB, of which 2,048 are what the library makes room for |
 /// | settings (TOML), which are at most 1 MiB | 1,024 | 8 KiB |
-pub static TARGETS: [Target; 9] = [
+pub static TARGETS: [Target; 11] = [
     colmap_binary::TARGET,
     colmap_text::TARGET,
     transforms::TARGET,
     ply::TARGET,
+    spz::TARGET,
+    sog::TARGET,
     points::TARGET,
     fixture::TARGET,
     checkpoint::TARGET,
