@@ -1,4 +1,4 @@
-//! SPZ, Niantic's compressed format: about a tenth of a PLY file.
+//! SPZ, Niantic's compressed format: 6 to 12 times smaller than PLY.
 //!
 //! [`write()`] writes version 4, [`read()`] reads versions 1 to 4. All numbers are little endian.
 //!
@@ -95,9 +95,10 @@ pub struct SpzSettings {
     /// Bits of positions after the binary point, 0 to 30. Default: as many as the farthest Gaussian
     /// leaves of 23. Other programs write 12; fewer bits make a smaller file.
     pub fractional_bits: Option<u8>,
-    /// Bits of the coefficients of degree 1, 1 to 8. Default 5, as other programs write.
+    /// Bits of the coefficients of degree 1, 1 to 8. Default 7; other programs write 5, which may
+    /// cost more than 2 dB (docs/FORMATS.md).
     pub sh1_bits: u8,
-    /// Bits of the coefficients of degrees 2 and 3, 1 to 8. Default 4, as other programs write.
+    /// Bits of the coefficients of degrees 2 and 3, 1 to 8. Default 7; other programs write 4.
     pub sh_rest_bits: u8,
 }
 
@@ -105,8 +106,8 @@ impl Default for SpzSettings {
     fn default() -> Self {
         Self {
             fractional_bits: None,
-            sh1_bits: 5,
-            sh_rest_bits: 4,
+            sh1_bits: 7,
+            sh_rest_bits: 7,
         }
     }
 }

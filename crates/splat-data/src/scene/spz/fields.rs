@@ -139,13 +139,13 @@ pub(super) fn encode_sh(scene: &SplatData, settings: &SpzSettings) -> Vec<u8> {
     .collect()
 }
 
-/// A coefficient as a multiple of 2^(8 - bits); 128 is 0 whatever the bits.
+/// A coefficient as a multiple of 2^(8 - bits); 128 is 0 whatever the bits. Rounded once: other
+/// writers round to a byte first and then halves upwards, which shifts every colour.
 fn sh_byte(value: f32, bits: u8) -> u8 {
-    let bucket = 1 << (8 - bits);
-    // Saturates far outside of a byte.
-    let steps = (128.0 * value.clamp(-2.0, 2.0)).round() as i32 + 128;
-    let steps = (steps + bucket / 2).div_euclid(bucket) * bucket;
-    steps.clamp(0, 255) as u8
+    let bucket = f32::from(1u16 << (8 - bits));
+    let steps = bucket * (128.0 * value / bucket).round() + 128.0;
+    // Saturates.
+    steps as u8
 }
 
 pub(super) fn decode_sh(header: &Header, bytes: &[u8], flip: AxisFlip) -> Vec<f32> {

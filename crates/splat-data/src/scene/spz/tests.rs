@@ -235,8 +235,8 @@ fn every_value_is_within_half_a_step() {
                 } else {
                     sh_rest_bits
                 };
-                // Half a bucket, half a step before it, and a step that 255 lacks at 1.
-                let bound = (f32::from(1u16 << (8 - bits)) + 1.0) / 2.0 / 128.0 + 1.0 / 128.0;
+                // Half a bucket, and a step that 255 lacks at 1.
+                let bound = f32::from(1u16 << (8 - bits)) / 256.0 + 1.0 / 128.0;
                 assert!((a - b).abs() <= bound, "{at}: {a} {b}");
             }
             assert_eq!(back.settings.antialias, Some(false));
