@@ -1,5 +1,5 @@
-//! Scenes as SOG: an archive of `meta.json` and images. Mutations change a file of it and correct its
-//! checksum, or nothing behind the checksum would be tested.
+//! Scenes as SOG: an archive of `meta.json` and images. Mutations change a file of it and correct
+//! its checksum, or nothing behind the checksum would be tested.
 
 use std::path::Path;
 

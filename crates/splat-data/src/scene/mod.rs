@@ -1,7 +1,7 @@
 //! Scene files: trained splats as plain data ([`SplatData`]), without tensors.
 //!
 //! [`read()`] and [`write()`] recognise the format by the file: [`ply`] is the layout of the 3DGS
-//! paper's code, exact and read by every viewer, [`spz`] a tenth of its size, [`sog`] a fifteenth.
+//! paper's code, exact and read by every viewer, [`spz`] and [`sog`] are several times smaller.
 //!
 //! ```
 //! use splat_data::{SplatData, scene};

@@ -1,4 +1,4 @@
-//! SOG, PlayCanvas' compressed format: images of codes, a fifteenth to a twentieth of a PLY file.
+//! SOG, PlayCanvas' compressed format: images of codes, 6 to 16 times smaller than PLY.
 //!
 //! A zip archive (`.sog`) or a folder with `meta.json` and lossless WebP images. Pixel i of every
 //! image but the palette, counted by rows, belongs to Gaussian i; [`write()`] sorts them along a
@@ -13,11 +13,11 @@
 //! | `shN_labels` | R + 256 G: entry of the palette | |
 //! | `shN_centroids` | 64 entries per row, a pixel for each coefficient; RGB: entries of a codebook | the coefficients of degrees 1 to 3 |
 //!
-//! Each codebook has up to 256 numbers, the palette up to 65,536 sets of coefficients. Positions are
-//! most precise near zero: to half a step of (range of the logarithm) / 65535, times 1 + \|x\|.
+//! Each codebook has up to 256 numbers, the palette up to 65,536 sets of coefficients. Positions
+//! are most precise near zero: to half a step of (range of the logarithm) / 65535, times 1 + \|x\|.
 //!
-//! The axes are those of PLY files, and so ours, as PlayCanvas' programs write them; the text of the
-//! specification names others (+y up), as it does for PLY.
+//! The axes are those of PLY files, and so ours, as PlayCanvas' programs write them; the text of
+//! the specification names others (+y up), as it does for PLY.
 //!
 //! `extras.burn_splat` of `meta.json` holds what the format has no place for: the origin, the scene
 //! scale and the background. Other programs see the scene without the offset of its origin. `model`
@@ -97,8 +97,8 @@ impl SogSettings {
     }
 }
 
-/// Writes `scene` to `path` as an archive with the default settings, replacing an existing file only
-/// when the new one is complete and on the disk.
+/// Writes `scene` to `path` as an archive with the default settings, replacing an existing file
+/// only when the new one is complete and on the disk.
 ///
 /// # Errors
 ///

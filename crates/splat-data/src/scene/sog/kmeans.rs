@@ -153,9 +153,9 @@ impl Points<'_> {
         }
     }
 
-    /// Members far from each other, by k-means++ (Arthur and Vassilvitskii 2007): each next one with a
-    /// probability proportional to its squared distance to those before. Fewer than `count` if all
-    /// others are equal to one of them.
+    /// Members far from each other, by k-means++ (Arthur and Vassilvitskii 2007): each next one
+    /// with a probability proportional to its squared distance to those before. Fewer than `count`
+    /// if all others are equal to one of them.
     fn start(&self, members: &[u32], count: usize, rng: &mut Pcg64Mcg) -> Vec<&[f32]> {
         let mut distances = vec![f32::INFINITY; members.len()];
         let mut next = rng.random_range(0..members.len());
@@ -221,8 +221,8 @@ impl Points<'_> {
     }
 }
 
-/// Centres in groups of [`LANES`], coordinate by coordinate, so that a point is compared with all of
-/// a group at once.
+/// Centres in groups of [`LANES`], coordinate by coordinate, so that a point is compared with all
+/// of a group at once.
 #[derive(PartialEq)]
 struct Centres {
     groups: Vec<[f32; LANES]>,
