@@ -26,6 +26,7 @@ pub mod sog;
 pub mod spz;
 
 mod axes;
+mod edit;
 mod error;
 mod format;
 mod formats;
