@@ -1,6 +1,7 @@
 //! The training loop, checkpoints and evaluation.
 
 pub mod calibration;
+pub mod compact;
 mod evaluate;
 mod hooks;
 mod photo;
