@@ -9,7 +9,8 @@ pub struct CalibrationSchedule {
     pub start: usize,
     /// Steps of the run.
     pub steps: usize,
-    final_share: f64,
+    /// What is left of all rates at the end.
+    pub final_share: f64,
 }
 
 impl CalibrationSettings {

@@ -20,8 +20,8 @@ pub struct CalibrationSettings {
     /// Rate of poses: radians for rotations, sizes of the scene for translations. Default 1e-3;
     /// gsplat has 1e-5, which corrects a fraction of a degree in its 30,000 steps.
     pub pose_rate: f64,
-    /// Cameras are refined after so many passes over the photos, or an eighth of the run where that
-    /// is shorter. Before, the first Gaussians leave holes, and cameras would move to where the
+    /// Poses are refined after so many passes over the photos, or an eighth of the run where that
+    /// is shorter. Before, the first Gaussians leave holes, and cameras would turn to where the
     /// picture is fuller. Default 10.
     pub start_passes: usize,
     /// Rate of the logarithms of focal lengths. Default 1e-3.

@@ -23,7 +23,7 @@ use super::{
     Checkpoint, CheckpointError, History, IntoLoss, LossTerms, Progress, StrategyKind, TrainError,
     TrainSettings, Warning, resolution_schedule, views,
 };
-use crate::calibration::{RefineIntrinsics, RefinePoses};
+use crate::calibration::{CalibrationSchedule, RefineIntrinsics, RefinePoses};
 use crate::hooks::{Hook, Hooks};
 
 type MakeModel<M> = dyn FnOnce(&SplatData, &Device) -> M + Send;
@@ -305,6 +305,12 @@ fn calibration(
     let schedule = config.calibration_schedule(capture);
     let mut hooks: Vec<Box<dyn Hook>> = Vec::new();
     if settings.intrinsics {
+        // A wrong lens is wrong in all views alike. The first Gaussians, whose colours are those of
+        // the points, show it best; later ones have made up for it.
+        let schedule = CalibrationSchedule {
+            start: 0,
+            ..schedule
+        };
         let hook = RefineIntrinsics::new(&capture.views, settings.clone(), schedule, device)?;
         hooks.push(Box::new(hook));
     }
