@@ -60,7 +60,7 @@ pub(super) fn run(args: &ConvertArgs, global: &GlobalArgs) -> Result<(), Failure
 /// Bytes of a file; `None` for pipes and devices.
 fn size_of(path: &Path) -> Option<u64> {
     let kind = std::fs::metadata(path).ok()?;
-    kind.is_file().then(|| kind.len())
+    kind.is_file().then_some(kind.len())
 }
 
 /// What was written, and how its size compares.

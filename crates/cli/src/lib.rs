@@ -3,6 +3,7 @@
 #[cfg(feature = "cpu")]
 mod bench;
 mod command_line;
+mod compact;
 mod convert;
 mod device;
 mod eval;
@@ -61,6 +62,7 @@ enum Command {
     Eval(eval::EvalArgs),
     Render(render::RenderArgs),
     Info(info::InfoArgs),
+    Compact(compact::CompactArgs),
     Convert(convert::ConvertArgs),
     Gradcheck(GradcheckArgs),
     #[cfg(feature = "cpu")]
@@ -76,6 +78,7 @@ pub fn main() -> ExitCode {
         Command::Eval(args) => eval::run(args, global),
         Command::Render(args) => render::run(args, global),
         Command::Info(args) => info::run(args, global),
+        Command::Compact(args) => compact::run(args, global),
         Command::Convert(args) => convert::run(args, global),
         Command::Gradcheck(args) => gradcheck::run(args, global),
         #[cfg(feature = "cpu")]

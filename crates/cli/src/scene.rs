@@ -4,7 +4,7 @@ use std::path::Path;
 
 use burn::tensor::Device;
 use clap::ValueEnum;
-use splat_data::SceneSettings;
+use splat_data::{SceneSettings, SplatData};
 use splat_model::{Gaussians, RenderSettings, ShPrecision};
 
 use super::{Failure, GlobalArgs, text};
@@ -29,14 +29,7 @@ pub(super) fn open(
     precision: PrecisionChoice,
     global: &GlobalArgs,
 ) -> Result<(Gaussians, RenderSettings), Failure> {
-    let mut data = splat_data::scene::read(path)?;
-    for what in &data.settings.not_understood {
-        global.say(format_args!(
-            "warning: {}: not followed: `{what}`",
-            path.display()
-        ));
-    }
-    ask_config(path, &mut data.settings, global);
+    let data = read(path, global)?;
     let mut gaussians = Gaussians::from_data(&data, device);
     if precision == PrecisionChoice::Half {
         gaussians = gaussians.with_sh_precision(ShPrecision::Half);
@@ -45,6 +38,19 @@ pub(super) fn open(
         }
     }
     Ok((gaussians, RenderSettings::of_scene(&data)))
+}
+
+/// Reads a scene with its render settings, with the warnings that they need.
+pub(super) fn read(path: &Path, global: &GlobalArgs) -> Result<SplatData, Failure> {
+    let mut data = splat_data::scene::read(path)?;
+    for what in &data.settings.not_understood {
+        global.say(format_args!(
+            "warning: {}: not followed: `{what}`",
+            path.display()
+        ));
+    }
+    ask_config(path, &mut data.settings, global);
+    Ok(data)
 }
 
 /// Reads missing settings from the `config.toml` beside the scene. A file that does not belong to a

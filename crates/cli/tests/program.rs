@@ -2,6 +2,8 @@
 //! bad input.
 #![cfg(feature = "cpu")]
 
+#[path = "program/files.rs"]
+mod files;
 #[path = "program/runs.rs"]
 #[cfg(unix)]
 mod runs;
