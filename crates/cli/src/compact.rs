@@ -25,7 +25,7 @@ use encoding::{Encoded, Encoder};
 Renders the views that were trained on after every change, and takes from the scene what costs no more
 than DB of their mean PSNR: Gaussians with little weight in the pictures, harmonics where colours hardly
 depend on the direction, and bits of the file. The file is read again and judged as it is. Nothing is
-trained; `splat train --recipe compact` makes a scene small from the beginning.")]
+trained.")]
 pub struct CompactArgs {
     /// Scene: PLY, SPZ or SOG
     pub scene: PathBuf,
