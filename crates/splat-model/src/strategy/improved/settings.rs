@@ -17,8 +17,8 @@ pub struct ImprovedGsSettings {
     /// Milestone: none is split or removed from this step on. Default 15,000.
     pub stop: usize,
     /// Interval: steps between refinements. In shorter runs a tenth of the time from `start` to
-    /// `stop`, though not fewer than 50, in which gradients of that many views are averaged. Default
-    /// 100.
+    /// `stop`, though not fewer than 50, in which gradients of that many views are averaged.
+    /// Default 100.
     pub every: usize,
     /// After so many steps, or at `start` where that is sooner, what is faint is removed: points of
     /// the capture that no photo needs. Default 300.
