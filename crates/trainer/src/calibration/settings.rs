@@ -24,12 +24,13 @@ pub struct CalibrationSettings {
     /// is shorter. Before, the first Gaussians leave holes, and cameras would turn to where the
     /// picture is fuller. Default 10.
     pub start_passes: usize,
-    /// Rate of the logarithms of focal lengths. Default 1e-3.
+    /// Rate of the logarithms of focal lengths. Default 5e-3: a lens must be found before the scene
+    /// has made up for a wrong one.
     pub focal_rate: f64,
     /// Rate of principal points, in sides of the photo. Default 3e-4.
     pub principal_rate: f64,
     /// Rate of the first distortion coefficients; those of higher powers of the radius follow at a
-    /// tenth of it for each power. Default 2e-3.
+    /// tenth of it for each power. Default 1e-2.
     pub distortion_rate: f64,
     /// All rates fall exponentially to this share of themselves at the end of the run. Default
     /// 0.01 (gsplat).
@@ -80,9 +81,9 @@ impl Default for CalibrationSettings {
             intrinsics: false,
             pose_rate: 1e-3,
             start_passes: 10,
-            focal_rate: 1e-3,
+            focal_rate: 5e-3,
             principal_rate: 3e-4,
-            distortion_rate: 2e-3,
+            distortion_rate: 1e-2,
             final_share: 0.01,
             align_steps: 200,
         }
