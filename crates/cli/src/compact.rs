@@ -75,18 +75,22 @@ pub(super) fn run(args: &CompactArgs, global: &GlobalArgs) -> Result<(), Failure
     }
 
     let judge = Judge::new(&train, &device);
-    let limit = judge.psnr(&splats)? - args.max_loss;
-    let settings = CompactSettings::new().with_max_loss(args.max_loss);
-    let compacted = smaller(&splats, &train, &settings, &device, global)?;
-    let progress = |done: usize, of: usize| {
-        global.say(format_args!(
-            "writing with fewer bits: {done} of about {of}"
-        ));
-    };
-    let found = encoder.encode(&compacted.splats, &judge, limit, progress)?;
-    let Some(encoded) = found else {
+    let whole = judge.psnr(&splats)?;
+    // What the format costs in any case is not there for anything else.
+    let own = (whole - encoder.most_precise(&splats, &judge)?).max(0.0);
+    if own > args.max_loss {
         return Err(Failure::Check(format!(
-            "{}: at its most precise this format costs more than the {} dB that are left; allow more with --max-loss, or write .ply",
+            "{}: this format alone costs {own:.3} dB, more than --max-loss {}; allow more, or write .ply",
+            args.out.display(),
+            args.max_loss
+        )));
+    }
+    let settings = CompactSettings::new().with_max_loss(args.max_loss - own);
+    let compacted = smaller(&splats, &train, &settings, &device, global)?;
+    let limit = whole - args.max_loss;
+    let Some(encoded) = fewer_bits(&encoder, &compacted.splats, &judge, limit, global)? else {
+        return Err(Failure::Check(format!(
+            "{}: the smaller scene cannot be written within the {} dB; allow more with --max-loss",
             args.out.display(),
             args.max_loss
         )));

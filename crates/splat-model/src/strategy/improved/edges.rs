@@ -119,7 +119,7 @@ mod tests {
         );
         assert_eq!(views_in_turn(3, 10, 7), [1, 2, 0]);
         assert!(views_in_turn(0, 10, 1).is_empty());
-        for count in [1, 7, 28, 43, 301] {
+        for count in [1usize, 7, 28, 43, 301] {
             let turns = count.div_ceil(10);
             let mut seen: Vec<_> = (0..turns)
                 .flat_map(|t| views_in_turn(count, 10, t))

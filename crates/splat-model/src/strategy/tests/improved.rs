@@ -70,7 +70,8 @@ fn a_wrong_refinement_by_improved_gs_is_found() {
     let splats = Splats::read(&model).unwrap();
     let right = kinds(&planned(&file, &splats, |_| ()));
     let wrong = |change: &dyn Fn(&mut Refining)| kinds(&planned(&file, &splats, change));
-    let gradients = file.values("statistics.grad2d");
+    // For a change to scores of any lifetime.
+    let gradients: &'static [f64] = file.values("statistics.grad2d").to_vec().leak();
     assert_ne!(right, wrong(&|by| by.unrecovered = 0));
     assert_ne!(right, wrong(&|by| by.budget += 1));
     assert_ne!(right, wrong(&|by| by.scores = gradients));
