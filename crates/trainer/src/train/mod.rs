@@ -14,7 +14,6 @@ mod progress;
 mod resolution_schedule;
 mod run;
 mod settings;
-mod sh_schedule;
 mod state;
 mod trainer;
 mod training_views;
