@@ -95,6 +95,9 @@ pub enum Strategy {
     Absgrad,
     /// Gaussians as samples (3DGS-MCMC): move dead ones, grow to a cap, add noise
     Mcmc,
+    /// Improved-GS: split along the longest axis, drawn by the edges of the photos, up to a budget;
+    /// with `improved.selection` in config.toml, GNS
+    Improved,
 }
 
 impl Strategy {
@@ -104,13 +107,14 @@ impl Strategy {
         config.strategy = match self {
             Self::Adc | Self::Absgrad => StrategyKind::Adc,
             Self::Mcmc => StrategyKind::Mcmc,
+            Self::Improved => StrategyKind::Improved,
         };
         // A limit holds for whichever strategy is taken.
         if let (None, Some(most)) = (config.max_gaussians(), most) {
             config.set_max_gaussians(most);
         }
         let (density, absgrad) = (&mut config.density, self == Self::Absgrad);
-        if self == Self::Mcmc || density.absgrad == absgrad {
+        if config.strategy != StrategyKind::Adc || density.absgrad == absgrad {
             return None;
         }
         density.absgrad = absgrad;
@@ -338,7 +342,8 @@ fn warn_of_settings(
         warn(format_args!(
             "--max-gaussians {most} is below the {count} {what}: all of them are kept, and none is added{}",
             match config.strategy {
-                StrategyKind::Adc => format!(" unless pruning leaves fewer than {most}"),
+                StrategyKind::Adc | StrategyKind::Improved =>
+                    format!(" unless pruning leaves fewer than {most}"),
                 StrategyKind::Mcmc => String::new(),
             }
         ));

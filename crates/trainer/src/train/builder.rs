@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use burn::tensor::Device;
 use splat_data::{Capture, SceneScale, SplatData, View};
 use splat_model::optimizer::{FieldOptimizer, SplatAdam};
-use splat_model::strategy::{Adc, Mcmc, RunSchedule, Strategy};
+use splat_model::strategy::{Adc, ImprovedGs, Mcmc, RunSchedule, Strategy};
 use splat_model::{Field, Gaussians, Optimized, SplatModel};
 
 use super::checkpoint::RunRecord;
@@ -221,6 +221,7 @@ impl<M: SplatModel> TrainerBuilder<M> {
         let strategy = strategy.unwrap_or_else(|| match config.strategy {
             StrategyKind::Adc => Box::new(Adc::new(config.density.clone())),
             StrategyKind::Mcmc => Box::new(Mcmc::new(config.mcmc.clone())),
+            StrategyKind::Improved => Box::new(ImprovedGs::new(config.improved.clone())),
         });
         let mut terms: Vec<String> = loss.names().map(str::to_owned).collect();
         terms.extend(strategy.loss_term_names());

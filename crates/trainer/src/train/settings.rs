@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 use splat_model::ops::{AdamRows, ClampGradient, RasterizeSettings};
-use splat_model::strategy::{AdcSettings, McmcSettings};
+use splat_model::strategy::{AdcSettings, ImprovedGsSettings, McmcSettings};
 use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale};
 
 use splat_data::text::{one_line, utf8};
@@ -77,6 +77,9 @@ pub struct TrainSettings {
     pub density: AdcSettings,
     /// The strategy `mcmc`. Where `max_gaussians` is absent, growth ends as it does for `density`.
     pub mcmc: McmcSettings,
+    /// The strategy `improved`. Where `max_gaussians` is absent, growth ends as it does for
+    /// `density`.
+    pub improved: ImprovedGsSettings,
     /// Refinement of the cameras. Default none.
     pub calibration: CalibrationSettings,
 }
@@ -91,6 +94,9 @@ pub enum StrategyKind {
     Adc,
     /// [`Mcmc`](splat_model::strategy::Mcmc).
     Mcmc,
+    /// [`ImprovedGs`](splat_model::strategy::ImprovedGs); with `improved.selection.final_gaussians`
+    /// that of GNS.
+    Improved,
 }
 
 impl TrainSettings {
@@ -120,6 +126,7 @@ impl Default for TrainSettings {
             learning_rates: LearningRates::default(),
             density: AdcSettings::default(),
             mcmc: McmcSettings::default(),
+            improved: ImprovedGsSettings::default(),
             calibration: CalibrationSettings::default(),
         }
     }
@@ -152,6 +159,7 @@ impl TrainSettings {
         match self.strategy {
             StrategyKind::Adc => self.density.max_gaussians,
             StrategyKind::Mcmc => self.mcmc.max_gaussians,
+            StrategyKind::Improved => self.improved.max_gaussians,
         }
     }
 
@@ -160,6 +168,7 @@ impl TrainSettings {
         match self.strategy {
             StrategyKind::Adc => self.density.max_gaussians = Some(most),
             StrategyKind::Mcmc => self.mcmc.max_gaussians = Some(most),
+            StrategyKind::Improved => self.improved.max_gaussians = Some(most),
         }
     }
 
@@ -228,6 +237,7 @@ impl TrainSettings {
             );
         }
         (self.mcmc.validate()).map_err(|problem| problem.replacen('`', "`mcmc.", 1))?;
+        (self.improved.validate()).map_err(|problem| problem.replacen('`', "`improved.", 1))?;
         (self.calibration.validate())
             .map_err(|problem| problem.replacen('`', "`calibration.", 1))?;
         if let Some(color) = self.background
@@ -332,6 +342,7 @@ impl TrainSettings {
             ("init.opacity", self.init.opacity),
             ("density.reset_opacity", self.density.reset_opacity),
             ("mcmc.init_opacity", self.mcmc.init_opacity),
+            ("improved.reset_opacity", self.improved.reset_opacity),
         ];
         if let Some((field, value)) = starts.iter().find(|(_, value)| *value <= cut) {
             return Err(format!(
@@ -463,6 +474,10 @@ mod tests {
         assert!(found.contains("`mcmc.init_opacity`"), "{found}");
         let found = problem(&|config| config.mcmc.growth = 0.5);
         assert!(found.contains("`mcmc.growth`"), "{found}");
+        let found = problem(&|config| config.improved.reset_opacity = 0.003);
+        assert!(found.contains("`improved.reset_opacity`"), "{found}");
+        let found = problem(&|config| config.improved.selection.overgrowth = 0.5);
+        assert!(found.contains("`improved.selection.overgrowth`"), "{found}");
         assert_eq!(
             problem(&|config| config.density.split_scale = f64::INFINITY),
             ""
