@@ -14,6 +14,7 @@ mod progress;
 mod resolution_schedule;
 mod run;
 mod settings;
+mod sh_schedule;
 mod state;
 mod trainer;
 mod training_views;

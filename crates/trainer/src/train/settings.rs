@@ -44,8 +44,8 @@ pub struct TrainSettings {
     pub coarse_halvings: u32,
     /// Steps between two doublings of the sides, in a run of 30,000. Default 250.
     pub coarse_every: usize,
-    /// One more degree of spherical harmonics every so many steps of a run of 30,000. Default
-    /// 1,000.
+    /// One more degree of spherical harmonics every so many steps of a run of 30,000. Shorter runs
+    /// have fewer, though not fewer than one pass over the photos takes. Default 1,000.
     pub sh_degree_every: usize,
     /// Multiply opacities by what the low-pass filter took away. Default false.
     pub antialias: bool,
