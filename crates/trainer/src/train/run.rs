@@ -74,7 +74,7 @@ impl<M: SplatModel> Trainer<M> {
         (self.watch.on_progress)(Progress {
             step,
             steps,
-            gaussians: self.state.model.model().count(),
+            gaussians: self.state.model.count(),
             history: &self.state.history,
         });
         Ok(())
