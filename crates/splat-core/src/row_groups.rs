@@ -70,7 +70,10 @@ impl RowGroups {
 
     /// Number of rows chosen.
     pub fn len(&self) -> usize {
-        self.chosen.iter().map(|group| self.range(*group).len()).sum()
+        self.chosen
+            .iter()
+            .map(|group| self.range(*group).len())
+            .sum()
     }
 
     /// True if no row is chosen.

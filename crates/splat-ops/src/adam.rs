@@ -102,7 +102,12 @@ pub fn adam_step_groups<const D: usize>(
     check_rows(&check, &param, [&moment_1, &moment_2], rows)?;
     let mut shape = param.dims().map(Some);
     shape[0] = Some(rows.len());
-    check.tensor("grad", &grad, shape, "that of `param` with a row for each of `rows`")?;
+    check.tensor(
+        "grad",
+        &grad,
+        shape,
+        "that of `param` with a row for each of `rows`",
+    )?;
     let inputs = OpInputs(AdamTensors {
         param: param.into_dispatch(),
         grad: grad.into_dispatch(),
@@ -154,7 +159,11 @@ pub fn adam_catch_up<const D: usize>(
         moment_2: moment_2.into_dispatch(),
     };
     let _span = trace_span!("adam catch-up").entered();
-    Ok(tensors(Dispatch::adam_catch_up(inputs, rows.clone(), gaps.to_vec())))
+    Ok(tensors(Dispatch::adam_catch_up(
+        inputs,
+        rows.clone(),
+        gaps.to_vec(),
+    )))
 }
 
 fn check_rows<const D: usize>(

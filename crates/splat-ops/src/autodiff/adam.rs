@@ -41,7 +41,9 @@ fn inner<B: AdamOps, C: CheckpointStrategy>(
     OpInputs(inputs.map(|input| input.into_primitive()))
 }
 
-fn leaves<B: AdamOps, C: CheckpointStrategy>(stepped: AdamOutputs<B>) -> AdamOutputs<Autodiff<B, C>> {
+fn leaves<B: AdamOps, C: CheckpointStrategy>(
+    stepped: AdamOutputs<B>,
+) -> AdamOutputs<Autodiff<B, C>> {
     AdamOutputs {
         param: Autodiff::<B, C>::from_inner(stepped.param),
         moment_1: Autodiff::<B, C>::from_inner(stepped.moment_1),

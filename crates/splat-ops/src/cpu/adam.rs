@@ -92,7 +92,13 @@ fn step<T: Real>(
         .zip(moment_2.par_chunks_mut(chunk))
         .zip(grad.slice::<T>().par_chunks(chunk))
         .for_each(|(((param, moment_1), moment_2), grad)| {
-            rows(step.rows, width, [param, moment_1, moment_2], grad, &numbers);
+            rows(
+                step.rows,
+                width,
+                [param, moment_1, moment_2],
+                grad,
+                &numbers,
+            );
         });
     outputs(stepped)
 }
@@ -136,7 +142,10 @@ fn groups<'a, T: Real>(
         .chunks_mut(size)
         .zip(moment_1.chunks_mut(size))
         .zip(moment_2.chunks_mut(size));
-    chosen(rows, groups.map(|((param, moment_1), moment_2)| [param, moment_1, moment_2]))
+    chosen(
+        rows,
+        groups.map(|((param, moment_1), moment_2)| [param, moment_1, moment_2]),
+    )
 }
 
 fn step_groups<T: Real>(

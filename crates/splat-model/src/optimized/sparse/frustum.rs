@@ -2,16 +2,16 @@
 //! would draw.
 //!
 //! A splat is drawn when its mean, plus or minus its extent, touches the image (`project`). With
-//! `reach` standard deviations in an extent and `b` the deviation of the low-pass filter, the extent
-//! along x is at most `reach (|J1| s + b)` pixels, s the largest scale and J1 the first row of the
-//! camera's Jacobian.
+//! `reach` standard deviations in an extent and `b` the deviation of the low-pass filter, the
+//! extent along x is at most `reach (|J1| s + b)` pixels, s the largest scale and J1 the first row
+//! of the camera's Jacobian.
 //!
-//! - A pinhole has `J1 = fx/z (w1 - u w3)`, with u in the bounds of the clamp. Times z, "left of the
-//!   right edge" becomes linear: `fx x - (W - cx + reach b) z < reach fx max|w1 - u w3| s`. So each
-//!   edge of the image is a half-space.
-//! - A perspective lens with distortion bends the edges. The directions that fall on the image, or on
-//!   a margin around it, are found by trying a grid of them; the half-spaces around these are tried
-//!   where no extent exceeds the margin.
+//! - A pinhole has `J1 = fx/z (w1 - u w3)`, with u in the bounds of the clamp. Times z, "left of
+//!   the right edge" becomes linear: `fx x - (W - cx + reach b) z < reach fx max|w1 - u w3| s`. So
+//!   each edge of the image is a half-space.
+//! - A perspective lens with distortion bends the edges. The directions from which an extent
+//!   reaches the image are found by trying a grid of them, for some ratios of scale to distance;
+//!   outside of the half-spaces around these nothing of such a ratio is seen.
 //! - A fisheye sees behind the image plane, where half-spaces do not help: its directions lie in a
 //!   cone.
 
@@ -24,8 +24,8 @@ use super::bounds::GroupBox;
 
 /// Relative error that rounding to single precision may cause, generously.
 const ROUNDING: f64 = 1e-5;
-/// Margins around the image that are tried, as shares of its longer side.
-const MARGINS: [f64; 3] = [0.05, 0.25, 1.0];
+/// Ratios of scale to distance for which directions are tried.
+const RATIOS: [f64; 6] = [0.001, 0.004, 0.016, 0.064, 0.25, 1.0];
 /// Directions of the half-spaces around a distorted image.
 const SIDES: usize = 16;
 /// Directions from the axis that are tried, and angles along each.
@@ -34,7 +34,7 @@ const ANGLES: usize = 192;
 /// Steps between angles and directions that a tried point stands for, on both sides.
 const CELL: f64 = 1.5;
 /// Factor for what lies between the points at which a Jacobian is evaluated.
-const JACOBIAN_SLACK: f64 = 1.2;
+const JACOBIAN_SLACK: f64 = 1.5;
 
 /// A camera, as a test of boxes.
 #[derive(Debug, Clone)]
@@ -79,21 +79,16 @@ struct HalfSpace {
     per_scale: f64,
 }
 
-/// A lens with distortion.
+/// A lens with distortion: the directions that it sees, by ratio.
 #[derive(Debug, Clone)]
 struct Bent {
-    /// Pixels of an extent for each unit of scale at distance 1, and those of the low-pass filter.
-    growth: f64,
-    blur: f64,
-    /// By margin.
     levels: Vec<Level>,
 }
 
-/// The directions that fall on the image or the margin around it.
+/// The directions from which Gaussians up to a ratio of scale to distance reach the image.
 #[derive(Debug, Clone)]
 struct Level {
-    /// In pixels.
-    margin: f64,
+    ratio: f64,
     /// Half-spaces around them: largest `cos(k) x/z + sin(k) y/z`.
     sides: [f64; SIDES],
     /// The largest angle from the axis.
@@ -239,11 +234,10 @@ impl Frustum {
 }
 
 impl Bent {
-    /// The level whose margin holds every extent of a group with this largest scale, nowhere nearer
-    /// than `nearest`.
+    /// The level of a group with this largest scale, nowhere nearer than `nearest`.
     fn level(&self, scale: f64, nearest: f64) -> Option<usize> {
-        let extent = (1.0 + ROUNDING) * (self.growth * scale / nearest + self.blur);
-        self.levels.iter().position(|level| extent <= level.margin)
+        let ratio = (1.0 + ROUNDING) * scale / nearest;
+        self.levels.iter().position(|level| ratio <= level.ratio)
     }
 }
 
@@ -268,7 +262,7 @@ fn reach(settings: &ProjectSettings) -> (f64, f64) {
     (reach, reach * settings.eps2d.sqrt())
 }
 
-/// `None` where the lens is too odd to say anything.
+/// `None` where the lens sees nothing, which is too odd to rely on.
 fn bent(camera: &Camera, w: &[[f64; 3]; 3], settings: &ProjectSettings) -> Option<Bent> {
     let Camera {
         intrinsics: [fx, fy, cx, cy],
@@ -279,20 +273,13 @@ fn bent(camera: &Camera, w: &[[f64; 3]; 3], settings: &ProjectSettings) -> Optio
     let fisheye = matches!(lens, Lens::OpenCvFisheye(_));
     let domain = lens.domain(camera.intrinsics, size);
     let (reach, blur) = reach(settings);
-    let jacobian = match fisheye {
-        true => fisheye_jacobian(&lens, domain.limit)?,
-        false => perspective_jacobian(&lens, domain.clamp)?,
-    };
-    let growth = reach * fx.max(fy) * JACOBIAN_SLACK * jacobian * stretch(w);
+    let growth = reach * fx.max(fy) * JACOBIAN_SLACK * stretch(w);
 
-    let longer = f64::from(size.width.max(size.height));
-    let mut levels: Vec<Level> = (MARGINS.iter())
-        .map(|margin| Level {
-            margin: margin * longer,
-            sides: [f64::NEG_INFINITY; SIDES],
-            angle: 0.0,
-        })
-        .collect();
+    let mut levels = RATIOS.map(|ratio| Level {
+        ratio,
+        sides: [f64::NEG_INFINITY; SIDES],
+        angle: 0.0,
+    });
     let last = if fisheye {
         domain.limit
     } else {
@@ -317,26 +304,30 @@ fn bent(camera: &Camera, w: &[[f64; 3]; 3], settings: &ProjectSettings) -> Optio
         let (sin, cos) = angle(middle).sin_cos();
         let ends = [angle(middle - CELL), angle(middle + CELL)];
         for j in 0..AZIMUTHS {
-            let (across, along) = azimuth(j as f64, AZIMUTHS).sin_cos();
+            let direction = azimuth(j as f64, AZIMUTHS);
+            let (across, along) = direction.sin_cos();
             let Some([a, b]) = bounded.distort([sin * along, sin * across, cos]) else {
                 continue;
             };
             let (x, y) = (fx * a + cx, fy * b + cy);
             let beyond = |value: f64, side: u32| (-value).max(value - f64::from(side));
             let outside = beyond(x, size.width).max(beyond(y, size.height));
-            for level in levels.iter_mut().filter(|level| outside <= level.margin) {
+            let slope = growth * steepness(&lens, domain.clamp, angle(middle), [along, across]);
+            for level in &mut levels {
+                // NaN is seen.
+                if outside > slope * level.ratio + blur {
+                    continue;
+                }
                 level.angle = level.angle.max(ends[1]);
                 if !fisheye {
-                    level.include(azimuth(j as f64, AZIMUTHS), ends);
+                    level.include(direction, ends);
                 }
             }
         }
     }
-    levels.retain(|level| level.angle > 0.0);
-    Some(Bent {
-        growth,
-        blur,
-        levels,
+    let sees = levels.iter().all(|level| level.angle > 0.0);
+    sees.then(|| Bent {
+        levels: levels.into(),
     })
 }
 
@@ -357,52 +348,37 @@ fn azimuth(index: f64, count: usize) -> f64 {
     TAU * index / count as f64
 }
 
-/// Largest length of a row of the Jacobian of a perspective lens at depth 1, within the clamp.
-fn perspective_jacobian(lens: &Lens, clamp: f64) -> Option<f64> {
-    const STEPS: usize = 24;
-    let bounded = lens.bounded();
-    let step = 1e-6 * clamp.clamp(1e-3, 1.0);
-    let mut largest: f64 = 0.0;
-    for i in 0..=STEPS {
-        // Inside, so that the lens is defined beside the point too.
-        let radius = (1.0 - 1e-4) * clamp * i as f64 / STEPS as f64;
-        for j in 0..STEPS {
-            let (sin, cos) = azimuth(j as f64, STEPS).sin_cos();
-            let (a, b) = (radius * cos, radius * sin);
-            let at = |a: f64, b: f64| bounded.distort([a, b, 1.0]);
-            let slope =
-                |next: [f64; 2], last: [f64; 2]| [0, 1].map(|i| (next[i] - last[i]) / (2.0 * step));
-            let da = slope(at(a + step, b)?, at(a - step, b)?);
-            let db = slope(at(a, b + step)?, at(a, b - step)?);
-            for row in 0..2 {
-                let along = da[row] * a + db[row] * b;
-                largest = largest.max(norm([da[row], db[row], along]));
-            }
+/// Largest length of a row of the Jacobian of a lens at depth 1 (at distance 1 for a fisheye), at
+/// this angle from the axis and in this direction around it; that of a perspective lens where the
+/// projection evaluates it, at the clamp at most.
+fn steepness(lens: &Lens, clamp: f64, angle: f64, [cos, sin]: [f64; 2]) -> f64 {
+    match lens {
+        Lens::Pinhole => f64::INFINITY,
+        Lens::OpenCv([k1, k2, p1, p2, k3, k4, k5, k6]) => {
+            let radius = angle.tan().min(clamp);
+            let (a, b, q) = (radius * cos, radius * sin, radius * radius);
+            let polynomial = |[x, y, z]: [&f64; 3]| {
+                let value = 1.0 + q * (x + q * (y + q * z));
+                (value, x + q * (2.0 * y + 3.0 * q * z))
+            };
+            let (above, rising) = polynomial([k1, k2, k3]);
+            let (below, falling) = polynomial([k4, k5, k6]);
+            let l = above / below;
+            let l1 = (rising - l * falling) / below;
+            let d11 = l + 2.0 * a * a * l1 + 2.0 * p1 * b + 6.0 * p2 * a;
+            let d12 = 2.0 * (a * b * l1 + p1 * a + p2 * b);
+            let d22 = l + 2.0 * b * b * l1 + 6.0 * p1 * b + 2.0 * p2 * a;
+            let row = |x: f64, y: f64| norm([x, y, x * a + y * b]);
+            row(d11, d12).max(row(d12, d22))
+        }
+        Lens::OpenCvFisheye([k1, k2, k3, k4]) => {
+            let u = angle * angle;
+            let slope = 1.0 + u * (3.0 * k1 + u * (5.0 * k2 + u * (7.0 * k3 + u * 9.0 * k4)));
+            let bent = angle * (1.0 + u * (k1 + u * (k2 + u * (k3 + u * k4))));
+            // Away from the axis and around it.
+            slope.abs().max((bent / angle.sin()).abs())
         }
     }
-    largest.is_finite().then_some(largest)
-}
-
-/// Largest length of a row of the Jacobian of a fisheye at distance 1.
-fn fisheye_jacobian(lens: &Lens, limit: f64) -> Option<f64> {
-    const STEPS: usize = 512;
-    let bounded = lens.bounded();
-    let at = |angle: f64| {
-        let (sin, cos) = angle.sin_cos();
-        bounded.distort([sin, 0.0, cos]).map(|[a, _]| a)
-    };
-    let step = 1e-6;
-    let mut largest: f64 = 0.0;
-    for i in 0..STEPS {
-        let angle = (limit - 2.0 * step) * (i as f64 + 0.5) / STEPS as f64;
-        // Away from the axis and around it.
-        let outwards = (at(angle + step)? - at((angle - step).max(0.0))?) / step;
-        let around = at(angle)? / angle.sin();
-        largest = largest.max(0.5 * outwards.abs()).max(around.abs());
-    }
-    // Between the last angle and the limit.
-    largest = largest.max(at(limit - step)?.abs() / limit.sin().abs().max(1e-3));
-    largest.is_finite().then_some(largest)
 }
 
 /// Most by which a matrix makes a vector longer: 1 for a rotation.

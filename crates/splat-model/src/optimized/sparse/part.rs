@@ -64,8 +64,8 @@ impl<M: SplatModel> Part<M> {
         self.boxes.iter().copied()
     }
 
-    /// Takes the gradients of the part's fields, by name, from those of a backward pass: rows as the
-    /// part has them.
+    /// Takes the gradients of the part's fields, by name, from those of a backward pass: rows as
+    /// the part has them.
     pub fn gradients(
         &self,
         whole: &SparseOptimized<M>,

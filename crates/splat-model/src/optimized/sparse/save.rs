@@ -1,5 +1,5 @@
-//! Saving and restoring of rows that are behind, as they are: saving changes nothing, and a run that
-//! goes on from a checkpoint catches them up as the first one would have.
+//! Saving and restoring of rows that are behind, as they are: saving changes nothing, and a run
+//! that goes on from a checkpoint catches them up as the first one would have.
 
 use burn::tensor::{Device, TensorData};
 use burn_pack::Scalar;

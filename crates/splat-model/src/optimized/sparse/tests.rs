@@ -272,13 +272,13 @@ fn values(model: &Gaussians) -> Vec<Vec<f32>> {
     ]
 }
 
-/// Largest difference, in units of the last place of the larger value or of 1/1000.
+/// Largest difference, in units of the last place of the larger value or of 1.
 fn difference(a: &Gaussians, b: &Gaussians) -> f32 {
     let pairs = values(a).into_iter().zip(values(b));
     pairs
         .flat_map(|(a, b)| a.into_iter().zip(b))
         .filter(|(a, b)| a.is_finite() && a != b)
-        .map(|(a, b)| (a - b).abs() / (f32::EPSILON * a.abs().max(b.abs()).max(1e-3)))
+        .map(|(a, b)| (a - b).abs() / (f32::EPSILON * a.abs().max(b.abs()).max(1.0)))
         .fold(0.0, f32::max)
 }
 
