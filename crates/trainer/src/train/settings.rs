@@ -61,7 +61,7 @@ pub struct TrainSettings {
     pub seen_rows_only: bool,
     /// A step whose views see at most this share of the Gaussians leaves out the others, see
     /// [`SparseOptimized`](splat_model::SparseOptimized): with the result of a step of all, but for
-    /// rounding. 0 means never. Default 0.5.
+    /// rounding. 0 means never. Default 0, until it has been measured.
     pub sparse_share: f64,
     /// Whether a run repeats bit for bit on a CubeCL device; false saves memory there, see
     /// [`RasterizeSettings::deterministic`]. On the CPU it always does. Default true.
@@ -118,7 +118,7 @@ impl Default for TrainSettings {
             background: None,
             ssim_weight: 0.2,
             seen_rows_only: false,
-            sparse_share: 0.5,
+            sparse_share: 0.0,
             deterministic: true,
             strategy: StrategyKind::default(),
             init: InitSettings::default(),

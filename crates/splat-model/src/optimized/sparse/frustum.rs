@@ -288,7 +288,7 @@ fn bent(camera: &Camera, w: &[[f64; 3]; 3], settings: &ProjectSettings) -> Optio
     // Half of the angles where the image is, if that is known, half beyond.
     let inner = match fisheye {
         true => 0.5 * last,
-        false => (2.0 * domain.clamp).atan().clamp(0.0, 0.5 * last),
+        false => (2.0 * domain.clamp).atan().min(0.5 * last).max(0.0),
     };
     let angle = |step: f64| {
         let half = 0.5 * ANGLES as f64;
@@ -296,7 +296,8 @@ fn bent(camera: &Camera, w: &[[f64; 3]; 3], settings: &ProjectSettings) -> Optio
             true => inner * step / half,
             false => inner + (last - inner) * (step - half) / half,
         };
-        angle.clamp(0.0, last)
+        // `clamp` would not have a limit of NaN.
+        angle.min(last).max(0.0)
     };
     let bounded = lens.bounded();
     for i in 0..ANGLES {
