@@ -10,6 +10,7 @@ use splat_data::{SplatData, View, scene as files};
 use splat_model::ops::OpError;
 use splat_trainer::compact::{CompactSettings, Compacted, Judge, compact};
 
+use super::convert::size_of;
 use super::photos::PhotoArgs;
 use super::{Failure, GlobalArgs, device, print, scene};
 use crate::report::progress::Progress;
@@ -76,9 +77,15 @@ pub(super) fn run(args: &CompactArgs, global: &GlobalArgs) -> Result<(), Failure
 
     let judge = Judge::new(&train, &device);
     let whole = judge.psnr(&splats)?;
+    if !whole.is_finite() {
+        return Err(Failure::BadInput(format!(
+            "{}: the scene has no PSNR to lose, it is {whole}; check the photos and their masks",
+            args.capture.display()
+        )));
+    }
     // What the format costs in any case is not there for anything else.
     let own = (whole - encoder.most_precise(&splats, &judge)?).max(0.0);
-    if own > args.max_loss {
+    if !(own <= args.max_loss) {
         return Err(Failure::Check(format!(
             "{}: this format alone costs {own:.3} dB, more than --max-loss {}; allow more, or write .ply",
             args.out.display(),
@@ -101,7 +108,7 @@ pub(super) fn run(args: &CompactArgs, global: &GlobalArgs) -> Result<(), Failure
             source,
         }
     })?;
-    let before = std::fs::metadata(&args.scene)?.len();
+    let before = size_of(&args.scene);
     print(&report(&compacted, &encoded, &args.out, before))?;
     if !held_out.is_empty() {
         // Of the file as it was written.
@@ -167,7 +174,7 @@ fn as_original(mut read: SplatData, original: &SplatData) -> SplatData {
 }
 
 /// The stages as a table.
-fn report(compacted: &Compacted, encoded: &Encoded, out: &Path, before: u64) -> String {
+fn report(compacted: &Compacted, encoded: &Encoded, out: &Path, before: Option<u64>) -> String {
     let mut text = format!(
         "{:16} {:>9} {:>31}  {:>8}\n",
         "", "Gaussians", "of degree 0, 1, 2, 3", "PSNR dB"
@@ -190,11 +197,11 @@ fn report(compacted: &Compacted, encoded: &Encoded, out: &Path, before: u64) -> 
         encoded.psnr
     );
     let bytes = encoded.bytes.len() as u64;
-    let _ = writeln!(
-        text,
-        "{}  {bytes} bytes, {:.1} % of {before}",
-        out.display(),
-        100.0 * bytes as f64 / before.max(1) as f64
-    );
+    let _ = write!(text, "{}  {bytes} bytes", out.display());
+    if let Some(before) = before {
+        let percent = 100.0 * bytes as f64 / before.max(1) as f64;
+        let _ = write!(text, ", {percent:.1} % of {before}");
+    }
+    text.push('\n');
     text
 }

@@ -57,8 +57,11 @@ pub(super) fn run(args: &ConvertArgs, global: &GlobalArgs) -> Result<(), Failure
     ))
 }
 
-/// Bytes of a file; `None` for pipes and devices.
-fn size_of(path: &Path) -> Option<u64> {
+/// Bytes of a scene; `None` for pipes and devices, and for the index of a folder of images.
+pub(super) fn size_of(path: &Path) -> Option<u64> {
+    if path.extension().is_some_and(|ending| ending == "json") {
+        return None;
+    }
     let kind = std::fs::metadata(path).ok()?;
     kind.is_file().then_some(kind.len())
 }

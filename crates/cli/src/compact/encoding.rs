@@ -65,7 +65,7 @@ impl Encoder {
         let Some(mut best) = self.write(scene, judge, &start)? else {
             return Ok(None);
         };
-        if best.psnr < limit {
+        if !(best.psnr >= limit) {
             return Ok(None);
         }
         let (mut choice, mut done) = (start, 1);
@@ -81,7 +81,7 @@ impl Encoder {
                 match self.write(scene, judge, &next)? {
                     // Positions that need more bits than there are.
                     None => continue,
-                    Some(tried) if tried.psnr < floor => break,
+                    Some(tried) if !(tried.psnr >= floor) => break,
                     Some(tried) => {
                         choice = next;
                         if tried.bytes.len() <= best.bytes.len() {
