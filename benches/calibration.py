@@ -3,12 +3,13 @@
 
     python3 benches/calibration.py warp CAPTURE OUT [--k1 -0.1] [--given-k1 0] [--given-focal 1.05]
     python3 benches/calibration.py perturb CAPTURE OUT [--degrees 1] [--share 0.01] [--seed 0]
+                                                      [--without-keypoints]
     python3 benches/calibration.py compare TRUTH REFINED
 
 `warp` resamples the photos of a pinhole capture as a lens with this k1 would have taken them, with a focal length that
 keeps every pixel inside of the old photo. Its cameras are the true ones, unless other values are given for them.
 `perturb` turns every camera of a capture by `degrees` about a random axis through its centre, and moves it by `share`
-of the scene's size (the median distance of cameras and points) in a random direction.
+of the scene's size (the median distance of cameras and points) in a random direction. Its keypoints stay as they are.
 `compare` finds the similarity that takes the centres of the refined cameras to the true ones best (Umeyama 1991) and
 prints the errors of rotations and centres that are left, and the intrinsics of both.
 
@@ -59,15 +60,15 @@ def read_cameras(folder):
 
 
 def read_images(folder):
-    """name -> (id, quaternion, translation, camera id)"""
+    """name -> (id, quaternion, translation, camera id, bytes of its keypoints)"""
     reader = Reader(folder / "images.bin")
     images = {}
     for _ in range(reader.take("Q")):
         number, *pose, camera = reader.take("I7dI")
         name = reader.name()
-        keypoints = reader.take("Q")
-        reader.at += 24 * keypoints
-        images[name] = (number, np.array(pose[:4]), np.array(pose[4:]), camera)
+        keypoints = 24 * reader.take("Q")
+        keypoints, reader.at = reader.data[reader.at : reader.at + keypoints], reader.at + keypoints
+        images[name] = (number, np.array(pose[:4]), np.array(pose[4:]), camera, keypoints)
     return images
 
 
@@ -88,8 +89,9 @@ def write_model(folder, cameras, images, source):
         out += struct.pack("<IiQQ", number, model, width, height) + np.asarray(parameters, "<f8").tobytes()
     (folder / "cameras.bin").write_bytes(out)
     out = struct.pack("<Q", len(images))
-    for name, (number, q, t, camera) in images.items():
-        out += struct.pack("<I7dI", number, *q, *t, camera) + name.encode() + b"\0" + struct.pack("<Q", 0)
+    for name, (number, q, t, camera, keypoints) in images.items():
+        out += struct.pack("<I7dI", number, *q, *t, camera) + name.encode() + b"\0"
+        out += struct.pack("<Q", len(keypoints) // 24) + keypoints
     (folder / "images.bin").write_bytes(out)
     shutil.copy(source / "points3D.bin", folder)
 
@@ -177,7 +179,7 @@ def warp(args):
         told[:2] *= args.given_focal
         told[4] = args.k1 if args.given_k1 is None else args.given_k1
         given[number] = (OPENCV, w, h, told)
-    for name, (_, _, _, camera) in images.items():
+    for name, (_, _, _, camera, _) in images.items():
         photo = np.asarray(Image.open(args.capture / "images" / name).convert("RGB"), dtype=float)
         h, w, _ = photo.shape
         _, _, _, (fx, fy, cx, cy, k1, *_) = new[camera]
@@ -192,7 +194,8 @@ def warp(args):
         path = (args.out / "images" / name).with_suffix(".png")
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(np.uint8(np.rint(out))).save(path)
-    images = {str(Path(name).with_suffix(".png")): image for name, image in images.items()}
+    # Keypoints are those of the old photos.
+    images = {str(Path(name).with_suffix(".png")): (*image[:4], b"") for name, image in images.items()}
     write_model(args.out / "sparse" / "0", given, images, source)
     write_model(args.out / "truth", new, images, source)
     for number, (_, _, _, true) in new.items():
@@ -200,7 +203,7 @@ def warp(args):
 
 
 def scene_size(images, points):
-    centres = [-matrix(q).T @ t for _, q, t, _ in images.values()]
+    centres = [-matrix(q).T @ t for _, q, t, _, _ in images.values()]
     return float(np.median([np.median(np.linalg.norm(points - centre, axis=1)) for centre in centres]))
 
 
@@ -210,12 +213,12 @@ def perturb(args):
     size = scene_size(images, read_points(source))
     rng = np.random.Generator(np.random.PCG64(args.seed))
     moved = {}
-    for name, (number, q, t, camera) in images.items():
+    for name, (number, q, t, camera, keypoints) in images.items():
         axis, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
         half = np.radians(args.degrees) / 2
         turned = product(np.array([np.cos(half), *(np.sin(half) * axis)]), q / np.linalg.norm(q))
         centre = -matrix(q).T @ t + args.share * size * shift
-        moved[name] = (number, turned, -matrix(turned) @ centre, camera)
+        moved[name] = (number, turned, -matrix(turned) @ centre, camera, b"" if args.without_keypoints else keypoints)
     shutil.copytree(args.capture / "images", args.out / "images")
     if (args.capture / "split.json").exists():
         shutil.copy(args.capture / "split.json", args.out)
@@ -271,6 +274,7 @@ def main():
     command.add_argument("--degrees", type=float, default=1.0)
     command.add_argument("--share", type=float, default=0.01)
     command.add_argument("--seed", type=int, default=0)
+    command.add_argument("--without-keypoints", action="store_true")
     command.set_defaults(run=perturb)
     command = commands.add_parser("compare")
     command.add_argument("truth", type=Path)

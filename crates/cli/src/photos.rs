@@ -76,8 +76,12 @@ impl PhotoArgs {
         CaptureSettings {
             downscale: self.downscale.unwrap_or(default.downscale),
             images: self.images.clone(),
-            split: self.hold_out.as_deref().map_or(default.split, hold_out),
+            split: self
+                .hold_out
+                .as_deref()
+                .map_or(SplitRule::default(), hold_out),
             memory: self.photo_memory.map(|mebibytes| mebibytes << 20),
+            ..default
         }
     }
 

@@ -197,6 +197,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     let config = args.config(resumed.as_ref(), global)?;
     let options = CaptureSettings {
         downscale: config.downscale,
+        observations: config.calibration.poses && config.calibration.bundle_adjustment,
         ..args.photos.options()
     };
     let capture = photos::load(&args.capture, &options, global)?;
@@ -245,6 +246,12 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         checkpoint.save(&file)
     });
     let trainer = shown(trainer, &progress).build()?;
+    if let Some(adjusted) = trainer.bundle_adjustment().filter(|_| fresh) {
+        global.say(format_args!(
+            "poses adjusted to {} keypoints: {:.2} pixels off in the median, {:.2} before",
+            adjusted.keypoints, adjusted.error_after, adjusted.error_before
+        ));
+    }
 
     let resume = args.resume_command(&out, global);
     let folder = RunFolder {

@@ -33,12 +33,12 @@ pub mod text;
 
 pub use camera::Camera;
 pub use capture::{
-    Capture, CaptureError, CaptureSettings, CaptureWarning, PhotoOnDisk, Point, Split, SplitRule,
-    View,
+    Capture, CaptureError, CaptureSettings, CaptureWarning, Observation, PhotoOnDisk, Point, Split,
+    SplitRule, View,
 };
 pub use replace::{
     WriteError, probe_file, probe_files, probe_folder, write_atomically, write_durably,
 };
 pub use scene::{SceneFileError, SceneSettings, SplatData};
 pub use scene_scale::SceneScale;
-pub use splat_core::{CameraModel, ImageSize, Lens, LensDomain};
+pub use splat_core::{BoundedLens, CameraModel, ImageSize, Lens, LensDomain};

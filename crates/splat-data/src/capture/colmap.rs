@@ -21,7 +21,7 @@ pub(super) const FORMAT: CaptureFormat = CaptureFormat {
 };
 
 /// Finds, reads and checks the model of the capture in `root`.
-pub(super) fn read(root: &Path, _: &CaptureSettings) -> ReadModel {
+pub(super) fn read(root: &Path, settings: &CaptureSettings) -> ReadModel {
     let (folder, mut warnings) = find(root)?;
     let files = ModelFiles::find(&folder)?;
     let read = |path: &Path| {
@@ -37,7 +37,7 @@ pub(super) fn read(root: &Path, _: &CaptureSettings) -> ReadModel {
         false => None,
     };
     let contents = (&cameras[..], &images[..], points.as_deref());
-    let model = parse(&files, contents, &mut warnings)?;
+    let model = parse(&files, contents, settings.observations, &mut warnings)?;
     Ok((model, warnings))
 }
 
@@ -45,6 +45,7 @@ pub(super) fn read(root: &Path, _: &CaptureSettings) -> ReadModel {
 fn parse(
     files: &ModelFiles,
     (cameras, images, points): (&[u8], &[u8], Option<&[u8]>),
+    observations: bool,
     warnings: &mut Vec<CaptureWarning>,
 ) -> Result<SparseModel, CaptureError> {
     let paths = [&*files.cameras, &files.images, &files.points];
@@ -52,7 +53,7 @@ fn parse(
         return assemble(
             paths,
             colmap_binary::parse_cameras(&files.cameras, cameras)?,
-            colmap_binary::parse_images(&files.images, images)?,
+            colmap_binary::parse_images(&files.images, images, observations)?,
             points.map_or(Ok(vec![]), |points| {
                 colmap_binary::parse_points(&files.points, points)
             })?,
@@ -60,7 +61,7 @@ fn parse(
     }
     let cameras = colmap_text::parse_cameras(&files.cameras, cameras)?;
     let cameras = cameras.checked(&files.cameras, "cameras", warnings);
-    let images = colmap_text::parse_images(&files.images, images)?;
+    let images = colmap_text::parse_images(&files.images, images, observations)?;
     let images = images.checked(&files.images, "images", warnings);
     let points = match points {
         Some(points) => colmap_text::parse_points(&files.points, points)?.checked(
@@ -73,10 +74,12 @@ fn parse(
     assemble(paths, cameras, images, points)
 }
 
-/// [`read`] for a model in memory: the contents of its cameras, images and points.
+/// [`read`] for a model in memory, with its observations: the contents of its cameras, images and
+/// points.
 pub(super) fn parse_model(binary: bool, [cameras, images, points]: [&[u8]; 3]) -> ReadModel {
     let mut warnings = Vec::new();
     let files = ModelFiles::of(Path::new(""), binary);
-    let model = parse(&files, (cameras, images, Some(points)), &mut warnings)?;
+    let contents = (cameras, images, Some(points));
+    let model = parse(&files, contents, true, &mut warnings)?;
     Ok((model, warnings))
 }

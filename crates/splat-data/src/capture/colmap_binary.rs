@@ -7,7 +7,7 @@ use std::fmt::Display;
 use std::path::Path;
 
 use super::colmap_models::{MOST_PARAMETERS, by_number};
-use super::colmap_records::{ColmapCamera, ColmapImage};
+use super::colmap_records::{ColmapCamera, ColmapImage, ColmapKeypoint, ColmapPoint};
 use super::{CaptureError, Point};
 
 /// Bytes of a camera record up to its parameters, of the shortest image record, and of the shortest
@@ -18,6 +18,9 @@ const MIN_POINT: usize = 8 + 3 * 8 + 3 + 8 + 8;
 /// Bytes of one keypoint (x, y, point id) and of one track entry (image id, keypoint index).
 const KEYPOINT: usize = 8 + 8 + 8;
 const TRACK_ENTRY: usize = 4 + 4;
+
+/// The point of a keypoint that has none.
+const NO_POINT: u64 = u64::MAX;
 
 /// Reads `cameras.bin`.
 pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapCamera>, CaptureError> {
@@ -37,8 +40,12 @@ pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapCamer
     })
 }
 
-/// Reads `images.bin`; the keypoints are skipped.
-pub(super) fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>, CaptureError> {
+/// Reads `images.bin`; the keypoints are skipped unless they are asked for.
+pub(super) fn parse_images(
+    path: &Path,
+    bytes: &[u8],
+    keypoints: bool,
+) -> Result<Vec<ColmapImage>, CaptureError> {
     let mut reader = Reader::new(path, bytes);
     reader.records("image", "images", MIN_IMAGE, |reader, record| {
         let id = reader.u32(record, "id")?;
@@ -46,27 +53,35 @@ pub(super) fn parse_images(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapImage>
         let translation = reader.f64s(record, "translation")?;
         let camera_id = reader.u32(record, "camera id")?;
         let name = reader.name(record)?;
-        reader.skip_list(record, "keypoints", KEYPOINT)?;
+        let keypoints = match keypoints {
+            true => reader.keypoints(record)?,
+            false => {
+                reader.skip_list(record, "keypoints", KEYPOINT)?;
+                vec![]
+            }
+        };
         Ok(ColmapImage {
             id,
             camera_id,
             name,
             quaternion,
             translation,
+            keypoints,
         })
     })
 }
 
-/// Reads `points3D.bin`; the tracks are skipped.
-pub(super) fn parse_points(path: &Path, bytes: &[u8]) -> Result<Vec<Point>, CaptureError> {
+/// Reads `points3D.bin`; the tracks are skipped, since the images' keypoints say the same.
+pub(super) fn parse_points(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapPoint>, CaptureError> {
     let mut reader = Reader::new(path, bytes);
     reader.records("point", "points", MIN_POINT, |reader, record| {
-        reader.take::<8>(record, "id")?;
+        let id = reader.u64(record, "id")?;
         let position = reader.f64s(record, "position")?;
         let color = reader.take::<3>(record, "colour")?;
         reader.take::<8>(record, "error")?;
         reader.skip_list(record, "track entries", TRACK_ENTRY)?;
-        Ok(Point { position, color })
+        let point = Point { position, color };
+        Ok(ColmapPoint { id, point })
     })
 }
 
@@ -149,6 +164,10 @@ impl<'a> Reader<'a> {
         self.take(record, field).map(i32::from_le_bytes)
     }
 
+    fn u64(&mut self, record: Record, field: &'static str) -> Result<u64, CaptureError> {
+        self.take(record, field).map(u64::from_le_bytes)
+    }
+
     fn f64(&mut self, record: Record, field: &'static str) -> Result<f64, CaptureError> {
         self.take(record, field).map(f64::from_le_bytes)
     }
@@ -167,7 +186,7 @@ impl<'a> Reader<'a> {
 
     /// A width or height: stored in 64 bits, of which 32 make sense.
     fn size(&mut self, record: Record, field: &'static str) -> Result<u32, CaptureError> {
-        let value = self.take(record, field).map(u64::from_le_bytes)?;
+        let value = self.u64(record, field)?;
         u32::try_from(value).map_err(|_| CaptureError::BadRecord {
             path: self.path.to_path_buf(),
             record: record.to_string(),
@@ -182,7 +201,7 @@ impl<'a> Reader<'a> {
         what: &'static str,
         min_size: usize,
     ) -> Result<usize, CaptureError> {
-        let count = self.take(record, "count").map(u64::from_le_bytes)?;
+        let count = self.u64(record, "count")?;
         let room = self.rest.len() / min_size;
         match usize::try_from(count) {
             Ok(len) if len <= room => Ok(len),
@@ -205,6 +224,20 @@ impl<'a> Reader<'a> {
         let len = self.list_len(record, what, entry)?;
         self.rest = &self.rest[len * entry..];
         Ok(())
+    }
+
+    /// The keypoints of an image that were matched with a point.
+    fn keypoints(&mut self, record: Record) -> Result<Vec<ColmapKeypoint>, CaptureError> {
+        let len = self.list_len(record, "keypoints", KEYPOINT)?;
+        let mut keypoints = Vec::new();
+        for _ in 0..len {
+            let position = self.f64s(record, "keypoints")?;
+            let point_id = self.u64(record, "keypoints")?;
+            if point_id != NO_POINT {
+                keypoints.push(ColmapKeypoint { position, point_id });
+            }
+        }
+        Ok(keypoints)
     }
 
     /// A name terminated by a zero byte.

@@ -5,9 +5,9 @@ use std::path::Path;
 
 use splat_core::CameraModel;
 
-use super::colmap_records::{ColmapCamera, ColmapImage};
+use super::colmap_records::{ColmapCamera, ColmapImage, ColmapPoint};
 use super::sparse_model::{Intrinsics, SparseCamera, SparseImage, SparseModel, viewmat};
-use super::{CaptureError, Point};
+use super::{CaptureError, Observation};
 use crate::text::Excerpt;
 
 /// Length in bytes of the longest path that systems accept.
@@ -18,7 +18,7 @@ pub(super) fn assemble(
     [cameras_file, images_file, points_file]: [&Path; 3],
     cameras: Vec<ColmapCamera>,
     mut images: Vec<ColmapImage>,
-    points: Vec<Point>,
+    points: Vec<ColmapPoint>,
 ) -> Result<SparseModel, CaptureError> {
     let mut by_id = HashMap::with_capacity(cameras.len());
     for camera in cameras {
@@ -50,20 +50,66 @@ pub(super) fn assemble(
     drop(names);
     images.sort_by(|a, b| a.name.cmp(&b.name));
 
-    let is_finite = |point: &Point| point.position.iter().all(|x| x.is_finite());
+    let is_finite = |point: &ColmapPoint| point.point.position.iter().all(|x| x.is_finite());
     if let Some(index) = points.iter().position(|point| !is_finite(point)) {
         return Err(CaptureError::BadRecord {
             path: points_file.to_path_buf(),
             record: format!("point {index} (counted from 0)"),
-            reason: format!("its position {:?} is not finite", points[index].position),
+            reason: format!(
+                "its position {:?} is not finite",
+                points[index].point.position
+            ),
         });
     }
     Ok(SparseModel {
+        observations: observations(images_file, &by_id, &images, &points)?,
         cameras: by_id.into_iter().map(|(id, c)| (id, sparse(c))).collect(),
         images: images.into_iter().map(image).collect(),
-        points,
+        points: points.into_iter().map(|point| point.point).collect(),
         ..SparseModel::default()
     })
+}
+
+/// The keypoints of the images, sorted by image. Those of points that the model does not have, as
+/// after points were removed, are left out.
+fn observations(
+    images_file: &Path,
+    cameras: &HashMap<u32, ColmapCamera>,
+    images: &[ColmapImage],
+    points: &[ColmapPoint],
+) -> Result<Vec<Observation>, CaptureError> {
+    if images.iter().all(|image| image.keypoints.is_empty()) {
+        return Ok(vec![]);
+    }
+    let index = |(index, point): (usize, &ColmapPoint)| (point.id, index as u32);
+    let by_id: HashMap<u64, u32> = points.iter().enumerate().map(index).collect();
+    let mut observations = Vec::new();
+    for (view, image) in images.iter().enumerate() {
+        let [fx, fy, cx, cy] = cameras[&image.camera_id].intrinsics;
+        for (index, keypoint) in image.keypoints.iter().enumerate() {
+            let Some(&point) = by_id.get(&keypoint.point_id) else {
+                continue;
+            };
+            let [x, y] = keypoint.position;
+            let position = [(x - cx) / fx, (y - cy) / fy];
+            if !position.iter().all(|x| x.is_finite()) {
+                return Err(CaptureError::BadRecord {
+                    path: images_file.to_path_buf(),
+                    record: format!("image {} (`{}`)", image.id, Excerpt(&image.name)),
+                    reason: format!(
+                        "the position {:?} of matched keypoint {index} (counted from 0) is not finite",
+                        keypoint.position
+                    ),
+                });
+            }
+            observations.push(Observation {
+                view: view as u32,
+                point,
+                position,
+            });
+        }
+    }
+    Ok(observations)
 }
 
 fn sparse(camera: ColmapCamera) -> SparseCamera {

@@ -62,7 +62,7 @@ fn images(folder: &Path) -> u64 {
         let files = ModelFiles::find(folder).ok()?;
         if !files.binary {
             let text = std::fs::read(&files.images).ok()?;
-            let images = colmap_text::parse_images(&files.images, &text).ok()?;
+            let images = colmap_text::parse_images(&files.images, &text, false).ok()?;
             return Some(images.records.len() as u64);
         }
         let mut file = File::open(&files.images).ok()?;

@@ -2,6 +2,7 @@
 
 use splat_core::Lens;
 
+use super::Point;
 use super::colmap_models::Layout;
 
 /// A camera.
@@ -29,6 +30,21 @@ impl ColmapCamera {
     }
 }
 
+/// A point with the id by which keypoints refer to it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct ColmapPoint {
+    pub id: u64,
+    pub point: Point,
+}
+
+/// A keypoint of an image that was matched with a point.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct ColmapKeypoint {
+    /// In pixels of the camera, pixel centres at + 0.5.
+    pub position: [f64; 2],
+    pub point_id: u64,
+}
+
 /// A registered image.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct ColmapImage {
@@ -39,4 +55,6 @@ pub(super) struct ColmapImage {
     pub quaternion: [f64; 4],
     /// Translation from world to camera.
     pub translation: [f64; 3],
+    /// Empty unless they are asked for.
+    pub keypoints: Vec<ColmapKeypoint>,
 }

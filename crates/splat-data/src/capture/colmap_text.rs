@@ -8,7 +8,7 @@ use std::path::Path;
 use std::str::{FromStr, SplitAsciiWhitespace};
 
 use super::colmap_models::{MOST_PARAMETERS, by_name};
-use super::colmap_records::{ColmapCamera, ColmapImage};
+use super::colmap_records::{ColmapCamera, ColmapImage, ColmapKeypoint, ColmapPoint};
 use super::{CaptureError, CaptureWarning, Point};
 use crate::text::{Excerpt, lines, without_mark};
 
@@ -76,14 +76,18 @@ pub(super) fn parse_cameras(
 }
 
 /// Parses `images.txt`: `IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME`, followed by a line of
-/// keypoints, `X Y POINT3D_ID` any number of times, which is skipped. The name extends to the end
-/// of its line, blanks included. `path` is used in messages.
+/// keypoints, `X Y POINT3D_ID` any number of times, which is skipped unless `keypoints` are asked
+/// for. The name extends to the end of its line, blanks included. `path` is used in messages.
 ///
 /// The line of keypoints may be empty, and some programs omit it then. Each line is therefore
 /// classified by its contents: keypoints are numbers only, in triples, which an image with a name
 /// is not. An ambiguous line (a name that is a number, or keypoints that look like ids) counts as
 /// keypoints if it follows an image.
-pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<ColmapImage>, CaptureError> {
+pub(super) fn parse_images(
+    path: &Path,
+    text: &[u8],
+    keypoints: bool,
+) -> Result<Listed<ColmapImage>, CaptureError> {
     /// State after the last non-blank line, and an empty one after it.
     #[derive(PartialEq)]
     enum Next {
@@ -92,7 +96,7 @@ pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<ColmapImag
         Image,
     }
     let file = File::new(path, text)?;
-    let mut records = Vec::new();
+    let mut records: Vec<ColmapImage> = Vec::new();
     let mut next = Next::Image;
     for fields in file.lines() {
         let fields = fields?;
@@ -103,16 +107,24 @@ pub(super) fn parse_images(path: &Path, text: &[u8]) -> Result<Listed<ColmapImag
             continue;
         }
         let image = image(fields.clone());
-        let keypoints = are_keypoints(fields.record, image.is_ok());
-        match (image, keypoints) {
-            (Err(_), true) if next != Next::Image => next = Next::Image,
-            (Ok(_), true) if next == Next::Keypoints => next = Next::Image,
-            (Ok(image), _) => {
+        let of_image = match (&image, are_keypoints(fields.record, image.is_ok())) {
+            (Err(_), true) => next != Next::Image,
+            (Ok(_), true) => next == Next::Keypoints,
+            (_, false) => false,
+        };
+        match (image, of_image) {
+            (_, true) => {
+                next = Next::Image;
+                if let (true, Some(last)) = (keypoints, records.last_mut()) {
+                    last.keypoints = matched_keypoints(fields)?;
+                }
+            }
+            (Ok(image), false) => {
                 records.push(image);
                 next = Next::Keypoints;
             }
-            (Err(reason), keypoints) => {
-                let taken_for = if keypoints {
+            (Err(reason), false) => {
+                let taken_for = if are_keypoints(fields.record, false) {
                     "keypoints that follow no image, or a damaged image"
                 } else {
                     "neither an image nor the keypoints of one"
@@ -144,7 +156,23 @@ fn image(mut fields: Fields<'_>) -> Result<ColmapImage, String> {
         name: name.to_owned(),
         quaternion,
         translation,
+        keypoints: vec![],
     })
+}
+
+/// The keypoints of a line that were matched with a point. Those without one have the id -1.
+fn matched_keypoints(mut fields: Fields<'_>) -> Result<Vec<ColmapKeypoint>, CaptureError> {
+    let mut keypoints = Vec::new();
+    while fields.fields.clone().next().is_some() {
+        let position = fields.array("keypoints")?;
+        let id: &str = fields.fields.clone().next().unwrap_or_default();
+        // Some programs write ids as they write positions.
+        let whole: f64 = fields.next("keypoints")?;
+        let point_id = id.parse().ok();
+        let point_id = point_id.or_else(|| (whole >= 0.0).then_some(whole as u64));
+        keypoints.extend(point_id.map(|point_id| ColmapKeypoint { position, point_id }));
+    }
+    Ok(keypoints)
 }
 
 /// True if a line is numbers only, in triples. If it might be an `image` too, every third number
@@ -168,10 +196,10 @@ fn are_keypoints(line: &str, image: bool) -> bool {
 
 /// Parses `points3D.txt`: `POINT3D_ID X Y Z R G B ERROR TRACK[]`. The track, pairs of an image id
 /// and a keypoint's index, is skipped; track and error are optional. `path` is used in messages.
-pub(super) fn parse_points(path: &Path, text: &[u8]) -> Result<Listed<Point>, CaptureError> {
+pub(super) fn parse_points(path: &Path, text: &[u8]) -> Result<Listed<ColmapPoint>, CaptureError> {
     let file = File::new(path, text)?;
     let point = |mut fields: Fields<'_>| {
-        let _id: u64 = fields.next("point id")?;
+        let id = fields.next("point id")?;
         let position = fields.array("position")?;
         let color = fields.array("colour")?;
         if fields.fields.clone().next().is_some() {
@@ -180,7 +208,8 @@ pub(super) fn parse_points(path: &Path, text: &[u8]) -> Result<Listed<Point>, Ca
         if !fields.fields.clone().count().is_multiple_of(2) {
             return Err(fields.error("its track is no list of pairs; is the line cut off?"));
         }
-        Ok(Point { position, color })
+        let point = Point { position, color };
+        Ok(ColmapPoint { id, point })
     };
     Ok(Listed {
         records: file

@@ -72,6 +72,7 @@ fn capture((mut model, warnings): (SparseModel, Vec<CaptureWarning>)) -> Capture
         },
         views,
         points: model.points,
+        observations: model.observations,
         background: model.background,
         warnings,
     }

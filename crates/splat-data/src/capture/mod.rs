@@ -27,6 +27,7 @@ pub mod in_memory;
 mod jpeg;
 mod lens_checks;
 mod masks;
+mod observations;
 mod on_disk;
 mod photo_file;
 mod photo_loader;
@@ -53,6 +54,7 @@ use crate::Camera;
 use random_points::Room;
 
 pub use error::CaptureError;
+pub use observations::Observation;
 pub use on_disk::PhotoOnDisk;
 pub use split::{Split, SplitRule};
 pub use warning::CaptureWarning;
@@ -72,6 +74,9 @@ pub struct Capture {
     /// Points of structure from motion, in file order; random ones, with a warning, if the capture
     /// has none. Never empty.
     pub points: Vec<Point>,
+    /// Keypoints at which photos show the points, sorted by view: those of a COLMAP model, if
+    /// [`CaptureSettings::observations`] asks for them.
+    pub observations: Vec<Observation>,
     /// Colour behind the scene, from 0 to 1, if the capture has one: white for a Blender capture,
     /// whose transparent photos were composited on it. `None` for photos of the real world.
     pub background: Option<[f32; 3]>,
@@ -137,6 +142,8 @@ pub struct CaptureSettings {
     /// the disk, with a warning, and is decoded by [`View::loaded`]. Default: half of the memory
     /// that is available, and no bound on systems other than Linux, which do not report it.
     pub memory: Option<u64>,
+    /// Read [`Capture::observations`] too, 32 bytes for each. Default false.
+    pub observations: bool,
 }
 
 impl CaptureSettings {
@@ -153,6 +160,7 @@ impl Default for CaptureSettings {
             images: None,
             split: SplitRule::default(),
             memory: None,
+            observations: false,
         }
     }
 }
@@ -259,6 +267,7 @@ impl Capture {
             photos,
             split,
             points: model.points,
+            observations: model.observations,
             background: model.background,
             views,
             warnings,

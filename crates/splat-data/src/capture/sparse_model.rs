@@ -5,8 +5,8 @@ use std::path::PathBuf;
 
 use splat_core::Lens;
 
-use super::Point;
 use super::random_points::Room;
+use super::{Observation, Point};
 
 /// A sparse model, read and checked: all numbers are finite, every image's camera exists, and there
 /// is at least one image.
@@ -18,6 +18,8 @@ pub(super) struct SparseModel {
     pub images: Vec<SparseImage>,
     /// Points, in file order; empty if the capture has none.
     pub points: Vec<Point>,
+    /// Keypoints of the images; empty if they were not asked for, or the format has none.
+    pub observations: Vec<Observation>,
     /// The folder of the photos, if the format names their paths.
     pub photos: Option<PathBuf>,
     /// The format's own split.

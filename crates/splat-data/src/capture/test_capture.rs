@@ -20,6 +20,9 @@ pub(super) struct TestCapture {
     pub points: Vec<(u64, Point)>,
 }
 
+/// Id of the fourth point, which keypoints refer to.
+const SEEN: i64 = i64::MAX - 3;
+
 /// Size of the two cameras.
 pub(super) const SIZES: [[u32; 2]; 2] = [[32, 24], [24, 30]];
 
@@ -82,8 +85,8 @@ impl TestCapture {
         }
     }
 
-    /// Writes the binary model to `folder`. Every second image has keypoints, the first of them
-    /// untracked.
+    /// Writes the binary model to `folder`. Every second image has three keypoints: one without a
+    /// point, one of the fourth point, and one of a point that is not there.
     pub fn write_binary(&self, folder: &Path) {
         std::fs::create_dir_all(folder).unwrap();
         std::fs::write(folder.join("cameras.bin"), self.cameras_bin()).unwrap();
@@ -113,7 +116,7 @@ impl TestCapture {
             out.extend(name.as_bytes());
             out.push(0);
             let keypoints: &[(f64, f64, i64)] = if index % 2 == 0 {
-                &[(1.5, 2.5, -1), (3.0, 4.0, 12)]
+                &[(1.5, 2.5, -1), (3.0, 4.0, SEEN), (5.0, 4.0, 12)]
             } else {
                 &[]
             };
@@ -180,8 +183,11 @@ impl TestCapture {
             )
             .unwrap();
             // An image without keypoints has an empty second line.
-            let keypoints = ["1.5 2.5 -1 3.0 4.0 12\n", "\n"][index % 2];
-            images.push_str(keypoints);
+            let keypoints = [
+                format!("1.5 2.5 -1 3.0 4.0 {SEEN} 5.0 4 12.0\n"),
+                "\n".into(),
+            ];
+            images.push_str(&keypoints[index % 2]);
         }
         let mut points = String::from("# 3D point list\n");
         for (id, Point { position, color }) in &self.points {

@@ -55,7 +55,7 @@ fn the_example_is_the_same_as_text() {
     let (cameras, path) = file("cameras.bin");
     let cameras = colmap_binary::parse_cameras(&path, &cameras).unwrap();
     let (images, path) = file("images.bin");
-    let images = colmap_binary::parse_images(&path, &images).unwrap();
+    let images = colmap_binary::parse_images(&path, &images, false).unwrap();
     let (binary, _) = colmap::read(&example(), &CaptureSettings::new()).unwrap();
     let text = TestCapture {
         cameras: cameras
@@ -80,6 +80,52 @@ fn the_example_is_the_same_as_text() {
     text.write_text(&root.path().join("sparse/0"));
     let (text, _) = colmap::read(root.path(), &CaptureSettings::new()).unwrap();
     assert_eq!(binary, text);
+}
+
+#[test]
+fn keypoints_are_read_if_asked_for() {
+    let (root, model) = good();
+    let settings = CaptureSettings::new().with_observations(true);
+    let read = |settings: &CaptureSettings| Capture::load(root.path(), settings).unwrap();
+    assert_eq!(read(&CaptureSettings::new()).observations, []);
+    let binary = read(&settings);
+    // Every second image in the order of the file, whose names are in reverse order.
+    let views: Vec<u32> = binary.observations.iter().map(|o| o.view).collect();
+    assert_eq!(views, [0, 2, 4, 6, 8]);
+    assert!(binary.observations.iter().all(|o| o.point == 3));
+    for observation in &binary.observations {
+        let [fx, fy, cx, cy] = binary.views[observation.view as usize].intrinsics;
+        let [x, y] = observation.position;
+        let pixel = [fx * x + cx, fy * y + cy];
+        assert!(
+            (pixel[0] - 3.0).abs() < 1e-12 && (pixel[1] - 4.0).abs() < 1e-12,
+            "{pixel:?}"
+        );
+    }
+    // Photos of half the size: the same places in the image plane.
+    let half = read(&settings.clone().with_downscale(2));
+    assert_eq!(half.observations, binary.observations);
+
+    std::fs::remove_dir_all(root.path().join("sparse")).unwrap();
+    model.write_text(&root.path().join("sparse"));
+    assert_eq!(read(&settings).observations, binary.observations);
+}
+
+#[test]
+fn a_keypoint_at_infinity_is_named() {
+    let (root, model) = good();
+    let mut images = model.images_bin();
+    let at = images.len() - 3 * 24 + 24;
+    images[at..at + 8].copy_from_slice(&f64::INFINITY.to_le_bytes());
+    std::fs::write(root.path().join("sparse/0/images.bin"), images).unwrap();
+    assert!(load(root.path()).is_ok());
+    let settings = CaptureSettings::new().with_observations(true);
+    let message = Capture::load(root.path(), &settings)
+        .unwrap_err()
+        .to_string();
+    for word in ["images.bin", "view r.png", "keypoint 0"] {
+        assert!(message.contains(word), "{message}");
+    }
 }
 
 #[test]

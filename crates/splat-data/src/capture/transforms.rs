@@ -172,6 +172,7 @@ fn assemble(
         cameras,
         images,
         points: Vec::new(),
+        observations: Vec::new(),
         photos: Some(placed.folder),
         split,
         background: blender.then_some(WHITE),

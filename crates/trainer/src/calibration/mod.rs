@@ -6,6 +6,7 @@
 //! your own can add them with [`TrainerBuilder::hook`](crate::TrainerBuilder::hook).
 
 mod align;
+mod bundle;
 mod intrinsics;
 mod motion;
 mod poses;
@@ -14,6 +15,7 @@ mod settings;
 
 pub(crate) use align::Aligning;
 pub use align::{AlignedScores, align_pose};
+pub use bundle::{BundleAdjustment, adjust_bundle};
 pub use intrinsics::RefineIntrinsics;
 pub use poses::RefinePoses;
 pub use schedule::CalibrationSchedule;

@@ -12,7 +12,7 @@
 //! leaves the middle of the picture in place.
 
 use burn::tensor::Tensor;
-use glam::{DMat3, DMat4, DVec3};
+use glam::{DMat3, DMat4, DQuat, DVec3};
 
 /// Numbers of a motion.
 pub(super) const MOTION: usize = 6;
@@ -58,6 +58,18 @@ pub(super) fn moved_f64(viewmat: DMat4, motion: [f64; MOTION], length: f64) -> D
     rigid * viewmat
 }
 
+/// The motion after which one view matrix is another.
+pub(super) fn motion_between(before: DMat4, after: DMat4, length: f64) -> [f64; MOTION] {
+    let rigid = after * before.inverse();
+    let turn = DMat3::from_mat4(rigid);
+    // Half the tangent of half the angle along the axis, twice.
+    let quaternion = DQuat::from_mat3(&turn);
+    let rotation = quaternion.xyz() * (2.0 / quaternion.w);
+    let shift = rigid.w_axis.truncate() / length - (DVec3::Z - turn.z_axis);
+    let ([r1, r2, r3], [s1, s2, s3]) = (rotation.to_array(), shift.to_array());
+    [r1, r2, r3, s1, s2, s3]
+}
+
 #[cfg(all(test, feature = "cpu"))]
 mod tests {
     use super::*;
@@ -84,6 +96,11 @@ mod tests {
             let turn = DMat3::from_mat4(after);
             let off = turn * turn.transpose() - DMat3::IDENTITY;
             assert!(off.to_cols_array().iter().all(|x| x.abs() < 1e-12));
+            let found = motion_between(start, after, 2.5);
+            assert!(
+                found.iter().zip(motion).all(|(a, b)| (a - b).abs() < 1e-12),
+                "{found:?} {motion:?}"
+            );
             let values = Tensor::<2>::from_floats([motion.map(|x| x as f32)], &Device::flex());
             let rows = moved(tensor(start), values, 2.5).into_data();
             let rows = rows.try_into_vec::<f32>().unwrap();

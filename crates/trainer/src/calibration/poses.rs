@@ -1,14 +1,14 @@
 //! Poses of the training views, refined with the scene.
 
 use burn::module::{Module, Param};
-use burn::tensor::{Device, Gradients, Tensor};
+use burn::tensor::{Device, Gradients, Tensor, TensorData};
 use splat_model::optimizer::{SplatAdam, StateRecord};
 use splat_model::strategy::StepInfo;
 use splat_model::{Camera, CameraTensors, FieldStep, Optimized, SceneScale};
 use splat_ops::OpError;
 
-use super::motion::{MOTION, moved, moved_f64};
-use super::{CalibrationSchedule, CalibrationSettings};
+use super::motion::{MOTION, motion_between, moved, moved_f64};
+use super::{BundleAdjustment, CalibrationSchedule, CalibrationSettings};
 use crate::{Hook, HookView};
 
 #[derive(Module, Debug)]
@@ -53,6 +53,27 @@ impl RefinePoses {
             schedule,
             scene,
         })
+    }
+
+    /// These poses, which begin as the adjusted ones and go on at their rate.
+    ///
+    /// # Errors
+    /// When the device fails.
+    pub fn adjusted(
+        mut self,
+        cameras: &[Camera],
+        adjusted: &BundleAdjustment,
+        settings: &CalibrationSettings,
+    ) -> Result<Self, OpError> {
+        let length = self.scene.length();
+        let motions: Vec<f32> = (cameras.iter().zip(&adjusted.viewmats))
+            .flat_map(|(camera, after)| motion_between(camera.viewmat, *after, length))
+            .map(|x| x as f32)
+            .collect();
+        let data = TensorData::new(motions, [cameras.len(), MOTION]);
+        (self.motions).update("motions", |old| Tensor::from_data(data, &old.device()))?;
+        self.rate = settings.adjusted_pose_rate;
+        Ok(self)
     }
 
     /// Cameras of training views, in their order, after what was refined so far.

@@ -17,9 +17,15 @@ pub struct CalibrationSettings {
     /// Refine focal lengths, principal points and distortion, one set for all views that begin with
     /// the same. Default false.
     pub intrinsics: bool,
-    /// Rate of poses: radians for rotations, sizes of the scene for translations. Default 1e-3;
-    /// gsplat has 1e-5, which corrects a fraction of a degree in its 30,000 steps.
+    /// Adjust the poses to the keypoints of the capture before training, where it has them, see
+    /// [`adjust_bundle`](super::adjust_bundle). Default true.
+    pub bundle_adjustment: bool,
+    /// Rate of poses that were not adjusted: radians for rotations, sizes of the scene for
+    /// translations. Default 1e-3.
     pub pose_rate: f64,
+    /// Rate of poses that were adjusted. Default 1e-6: keypoints fix a pose to a hundredth of a
+    /// degree, and photos do not know it better. gsplat has 1e-5.
+    pub adjusted_pose_rate: f64,
     /// Poses are refined after so many passes over the photos, or an eighth of the run where that
     /// is shorter. Before, the first Gaussians leave holes, and cameras would turn to where the
     /// picture is fuller. Default 10.
@@ -58,6 +64,7 @@ impl CalibrationSettings {
     pub fn validate(&self) -> Result<(), String> {
         let rates = [
             ("pose_rate", self.pose_rate),
+            ("adjusted_pose_rate", self.adjusted_pose_rate),
             ("focal_rate", self.focal_rate),
             ("principal_rate", self.principal_rate),
             ("distortion_rate", self.distortion_rate),
@@ -79,7 +86,9 @@ impl Default for CalibrationSettings {
         Self {
             poses: false,
             intrinsics: false,
+            bundle_adjustment: true,
             pose_rate: 1e-3,
+            adjusted_pose_rate: 1e-6,
             start_passes: 10,
             focal_rate: 5e-3,
             principal_rate: 3e-4,

@@ -23,7 +23,9 @@ use super::{
     Checkpoint, CheckpointError, History, IntoLoss, LossTerms, Progress, StrategyKind, TrainError,
     TrainSettings, Warning, resolution_schedule, views,
 };
-use crate::calibration::{CalibrationSchedule, RefineIntrinsics, RefinePoses};
+use crate::calibration::{
+    BundleAdjustment, CalibrationSchedule, RefineIntrinsics, RefinePoses, adjust_bundle,
+};
 use crate::hooks::{Hook, Hooks};
 
 type MakeModel<M> = dyn FnOnce(&SplatData, &Device) -> M + Send;
@@ -202,7 +204,14 @@ impl<M: SplatModel> TrainerBuilder<M> {
         let loss = loss.unwrap_or_else(|| LossTerms::l1_ssim(self.config.ssim_weight));
         let schedule = schedule(&self.capture, &self.config)?;
         let device = self.device.without_autodiff().autodiff();
-        let calibrating = calibration(&self.capture, &self.config, schedule.scene_scale, &device)?;
+        let adjusted = adjusted(&self.capture, &self.config, &mut self.watch);
+        let calibrating = calibration(
+            &self.capture,
+            &self.config,
+            schedule.scene_scale,
+            adjusted.as_ref(),
+            &device,
+        )?;
         // Before other hooks, which then see the cameras as they are rendered.
         self.hooks.0.splice(0..0, calibrating);
         check_hook_names(&self.hooks)?;
@@ -255,7 +264,11 @@ impl<M: SplatModel> TrainerBuilder<M> {
             TrainError::Setup(format!("the strategy {name}: {reason}"))
         };
         with_init.validate().map_err(wrong)?;
-        let splats = first_gaussians(&self.capture, &init, schedule.scene_scale, origin)?;
+        let points = match &adjusted {
+            Some(adjusted) => adjusted.points.clone(),
+            None => self.capture.points.iter().map(|p| p.position).collect(),
+        };
+        let splats = first_gaussians(&self.capture, &points, &init, schedule.scene_scale, origin)?;
         let model = (self.model)(&splats, &device);
         let model = optimized(model, &config, schedule.scene_scale, &self.optimizer)?;
         strategy.check(model.fields()).map_err(wrong)?;
@@ -289,9 +302,30 @@ impl<M: SplatModel> TrainerBuilder<M> {
             record,
             losses: LossLog::default(),
             in_step: false,
+            adjusted,
             coarse: resolution_schedule::CoarseViews::default(),
         })
     }
+}
+
+/// Poses and points adjusted to the keypoints of the capture, if poses are refined and the keypoints
+/// fit.
+fn adjusted(
+    capture: &Capture,
+    config: &TrainSettings,
+    watch: &mut Watch,
+) -> Option<BundleAdjustment> {
+    let settings = &config.calibration;
+    if !(settings.poses && settings.bundle_adjustment) {
+        return None;
+    }
+    let adjusted = adjust_bundle(capture)?;
+    if !adjusted.fits {
+        let [before, after] = [adjusted.error_before, adjusted.error_after];
+        (watch.on_warning)(&Warning::KeypointsDoNotFit { before, after });
+        return None;
+    }
+    Some(adjusted)
 }
 
 /// The hooks that refine the cameras, as far as the settings want it.
@@ -299,6 +333,7 @@ fn calibration(
     capture: &Capture,
     config: &TrainSettings,
     scene: SceneScale,
+    adjusted: Option<&BundleAdjustment>,
     device: &Device,
 ) -> Result<Vec<Box<dyn Hook>>, TrainError> {
     let settings = &config.calibration;
@@ -316,7 +351,11 @@ fn calibration(
     }
     if settings.poses {
         let views = capture.split.train.len();
-        let hook = RefinePoses::new(views, scene, settings, schedule, device)?;
+        let mut hook = RefinePoses::new(views, scene, settings, schedule, device)?;
+        if let Some(adjusted) = adjusted {
+            let cameras: Vec<_> = capture.train_views().map(View::camera).collect();
+            hook = hook.adjusted(&cameras, adjusted, settings)?;
+        }
         hooks.push(Box::new(hook));
     }
     Ok(hooks)

@@ -16,19 +16,19 @@ pub(super) fn default_max_gaussians(capture: &Capture) -> usize {
     (photos.clone().sum::<usize>() / 100).max(photos.max().unwrap_or(0) * 7 / 10)
 }
 
-/// One Gaussian per point of the capture, relative to the origin.
+/// One Gaussian per point of the capture, at these positions, relative to the origin.
 pub(super) fn first_gaussians(
     capture: &Capture,
+    points: &[[f64; 3]],
     settings: &InitSettings,
     scale: SceneScale,
     origin: [f64; 3],
 ) -> Result<SplatData, TrainError> {
-    let points = &capture.points;
     let positions: Vec<_> = points
         .iter()
-        .map(|p| std::array::from_fn(|axis| (p.position[axis] - origin[axis]) as f32))
+        .map(|p| std::array::from_fn(|axis| (p[axis] - origin[axis]) as f32))
         .collect();
-    let colors: Vec<_> = points.iter().map(|p| p.color).collect();
+    let colors: Vec<_> = capture.points.iter().map(|p| p.color).collect();
     let splats = splats_from_points(&positions, &colors, scale, settings);
     let mut splats = splats.map_err(|source| TrainError::Init {
         capture: capture.root.clone(),

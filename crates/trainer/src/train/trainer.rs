@@ -24,6 +24,7 @@ use super::{
     Checkpoint, LossTerms, TargetView, TrainError, TrainSettings, Warning, resolution_schedule,
     views, warnings,
 };
+use crate::calibration::BundleAdjustment;
 use crate::hooks::{HookView, Purpose};
 use crate::photo::{mask_of, pixels_u8};
 
@@ -61,6 +62,7 @@ pub struct Trainer<M: SplatModel = Gaussians> {
     /// Whether a step is half done.
     pub(super) in_step: bool,
     pub(super) coarse: resolution_schedule::CoarseViews,
+    pub(super) adjusted: Option<BundleAdjustment>,
 }
 
 /// A view of a step after its loss was measured.
@@ -111,6 +113,11 @@ impl<M: SplatModel> Trainer<M> {
         }
         self.read_losses()?;
         Ok(Checkpoint::of(&self.state, &self.record)?)
+    }
+
+    /// How poses and points were adjusted to the keypoints of the capture, if they were.
+    pub fn bundle_adjustment(&self) -> Option<&BundleAdjustment> {
+        self.adjusted.as_ref()
     }
 
     /// Size of the scene, from which every length of the run follows.

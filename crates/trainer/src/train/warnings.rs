@@ -82,6 +82,13 @@ pub enum Warning {
         /// Their names.
         views: Vec<String>,
     },
+    /// The keypoints of the capture disagree with its photos and cameras.
+    KeypointsDoNotFit {
+        /// Their median distance from the projected points, pixels.
+        before: f64,
+        /// The least that poses and points can reach.
+        after: f64,
+    },
     /// The state of the run could not be saved.
     NotSaved {
         /// Steps done.
@@ -223,6 +230,10 @@ impl fmt::Display for Warning {
                 f,
                 "{}: the photo has other pixels than the one that the run was begun with; it goes on with those there are now",
                 Names(views)
+            ),
+            Self::KeypointsDoNotFit { before, after } => write!(
+                f,
+                "the keypoints of the model are not those of these photos or cameras: {before:.2} pixels off in the median, and {after:.2} at best; poses are refined by the photos alone"
             ),
             Self::NotSaved { step, reason } => write!(
                 f,

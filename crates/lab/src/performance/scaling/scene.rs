@@ -112,6 +112,7 @@ pub fn synthetic_capture(gaussians: usize, size: PhotoSize) -> Capture {
         photos: PathBuf::from("synthetic"),
         views,
         points,
+        observations: vec![],
         background: None,
         split: Split {
             train: (0..VIEWS).collect(),

@@ -29,11 +29,13 @@ fn file(after: impl Fn(usize) -> &'static str) -> String {
 }
 
 fn images(text: impl AsRef<[u8]>) -> Vec<ColmapImage> {
-    parse_images(PATH.as_ref(), text.as_ref()).unwrap().records
+    parse_images(PATH.as_ref(), text.as_ref(), false)
+        .unwrap()
+        .records
 }
 
 fn error(text: impl AsRef<[u8]>) -> String {
-    let error = parse_images(PATH.as_ref(), text.as_ref()).unwrap_err();
+    let error = parse_images(PATH.as_ref(), text.as_ref(), false).unwrap_err();
     let message = error.to_string();
     assert!(
         message.starts_with(PATH) && !message.contains('\n'),
@@ -75,7 +77,7 @@ fn images_are_found_whatever_follows_them() {
             mark.to_owned() + &text,
             mark.to_owned() + &text.replace('\n', "\r\n"),
         ] {
-            let listed = parse_images(PATH.as_ref(), text.as_bytes()).unwrap();
+            let listed = parse_images(PATH.as_ref(), text.as_bytes(), false).unwrap();
             let names: Vec<&str> = listed.records.iter().map(|image| &*image.name).collect();
             assert_eq!(names, NAMES, "{name}: {text:?}");
             assert_eq!(listed.announced, Some(5));
