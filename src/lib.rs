@@ -52,7 +52,7 @@
 //! | [`render`](model::render()) | the three ops composed |
 //! | [`Optimized`](model::Optimized) | a model with the optimisers of its fields |
 //! | [`RowEdit`](model::RowEdit) | an edit of the rows of a model, moments included |
-//! | [`Strategy`](model::strategy::Strategy) | the trait of density control; [`Adc`](model::strategy::Adc), [`Mcmc`](model::strategy::Mcmc) |
+//! | [`Strategy`](model::strategy::Strategy) | the trait of density control; [`Adc`](model::strategy::Adc), [`Mcmc`](model::strategy::Mcmc), [`ImprovedGs`](model::strategy::ImprovedGs) |
 //! | [`losses`](model::losses) | L1, MSE, PSNR and SSIM on tensors |
 //! | [`Capture`](data::Capture), [`Camera`](data::Camera) | photos with their cameras and points |
 //! | [`SplatData`](data::SplatData), [`scene`](data::scene) | a scene as plain arrays, and its files |

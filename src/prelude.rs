@@ -8,7 +8,8 @@ pub use burn::tensor::{Device, Gradients, Int, Tensor, TensorData};
 pub use splat_data::{Camera, Capture, CaptureSettings, ImageSize, SceneScale, SplatData, View};
 pub use splat_model::optimizer::{SplatAdam, StateRecord};
 pub use splat_model::strategy::{
-    Adc, AdcSettings, Mcmc, McmcSettings, Refinement, ScreenWants, StepContext, StepInfo, Strategy,
+    Adc, AdcSettings, ImprovedGs, ImprovedGsSettings, Mcmc, McmcSettings, Refinement, ScreenWants,
+    SelectionSettings, StepContext, StepInfo, Strategy,
 };
 pub use splat_model::{
     CameraTensors, Field, FieldStep, Gaussians, InitSettings, LearningRates, Moments, Optimized,

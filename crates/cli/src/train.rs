@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use clap::builder::PossibleValuesParser;
 use clap::{Args, ValueEnum};
 
 use super::command_line::CommandLine;
@@ -17,7 +18,9 @@ use crate::report::progress::Progress;
 use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
 use resume::Interrupted;
 use splat_data::{Capture, CaptureSettings};
-use splat_trainer::{Checkpoint, StrategyKind, TrainSettings, Trainer, TrainerBuilder};
+use splat_trainer::{
+    Checkpoint, RECIPES, Recipe, StrategyKind, TrainSettings, Trainer, TrainerBuilder,
+};
 
 /// The held-out views are measured this many times during a run, for the curves.
 const MEASUREMENTS: usize = 10;
@@ -35,6 +38,7 @@ const AUTOSAVE: u64 = 60;
   splat train examples/data/saharov --steps 1000
   splat train photos/ --downscale 2 --steps 7000 --out out/garden
   splat train photos/ --images images_4
+  splat train photos/ --recipe compact
   splat train photos/ --resume out/garden
 
 Writes to DIR: scene.ply, metrics.json, config.toml, curves.svg, losses.csv and views/*.png (truth
@@ -56,6 +60,9 @@ pub struct TrainArgs {
     pub steps: Option<usize>,
     #[command(flatten)]
     pub photos: PhotoArgs,
+    /// Settings under a name, see docs/RECIPES.md [default: default]
+    #[arg(long, value_parser = recipe_names(), value_name = "NAME", conflicts_with_all = ["config", "resume"])]
+    pub recipe: Option<String>,
     /// Highest degree of spherical harmonics, 0 to 3 [default: 3]
     #[arg(long, value_name = "D")]
     pub sh_degree: Option<usize>,
@@ -86,6 +93,11 @@ pub struct TrainArgs {
     pub autosave: u64,
 }
 
+/// Values of `--recipe`.
+fn recipe_names() -> PossibleValuesParser {
+    PossibleValuesParser::new(RECIPES.iter().map(|recipe| recipe.name))
+}
+
 /// Values of `--strategy`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 pub enum Strategy {
@@ -95,6 +107,9 @@ pub enum Strategy {
     Absgrad,
     /// Gaussians as samples (3DGS-MCMC): move dead ones, grow to a cap, add noise
     Mcmc,
+    /// Improved-GS: split along the longest axis, drawn by the edges of the photos, up to a budget;
+    /// with `improved.selection` in config.toml, GNS
+    Improved,
 }
 
 impl Strategy {
@@ -104,13 +119,14 @@ impl Strategy {
         config.strategy = match self {
             Self::Adc | Self::Absgrad => StrategyKind::Adc,
             Self::Mcmc => StrategyKind::Mcmc,
+            Self::Improved => StrategyKind::Improved,
         };
         // A limit holds for whichever strategy is taken.
         if let (None, Some(most)) = (config.max_gaussians(), most) {
             config.set_max_gaussians(most);
         }
         let (density, absgrad) = (&mut config.density, self == Self::Absgrad);
-        if self == Self::Mcmc || density.absgrad == absgrad {
+        if config.strategy != StrategyKind::Adc || density.absgrad == absgrad {
             return None;
         }
         density.absgrad = absgrad;
@@ -132,7 +148,10 @@ impl TrainArgs {
         let mut config = match (resumed, &self.config) {
             (Some(run), _) => run.checkpoint.settings().clone(),
             (None, Some(path)) => text::read_config(path)?,
-            (None, None) => TrainSettings::default(),
+            (None, None) => {
+                let recipe = self.recipe.as_deref().and_then(Recipe::of_name);
+                recipe.map_or_else(TrainSettings::default, |recipe| recipe.settings())
+            }
         };
         if let Some(note) = self
             .strategy
@@ -345,7 +364,8 @@ fn warn_of_settings(
         warn(format_args!(
             "--max-gaussians {most} is below the {count} {what}: all of them are kept, and none is added{}",
             match config.strategy {
-                StrategyKind::Adc => format!(" unless pruning leaves fewer than {most}"),
+                StrategyKind::Adc | StrategyKind::Improved =>
+                    format!(" unless pruning leaves fewer than {most}"),
                 StrategyKind::Mcmc => String::new(),
             }
         ));

@@ -7,6 +7,7 @@ use burn::module::{Module, ModuleMapper, ModuleVisitor, Param};
 use burn::tensor::{Gradients, Tensor};
 
 use super::FieldGradients;
+use crate::{LearningRates, SplatModel};
 
 /// Reshapes `[N, ...]` to `[N, width]`.
 pub(super) fn flat<const D: usize>(value: Tensor<D>) -> Tensor<2> {
@@ -98,6 +99,24 @@ impl<F: FnMut(&str, Tensor<2>)> VisitField for ValuesOf<F> {
             value
         };
         (self.0)(name, flat(value));
+    }
+}
+
+/// The value of a field `[N, width]`, in the autodiff graph where the model is.
+pub(crate) fn tracked_field<M: SplatModel>(model: &M, name: &str) -> Option<Tensor<2>> {
+    let fields = model.fields(&LearningRates::default()).into_iter();
+    let field = fields.filter(|field| field.name == name);
+    let names = field.map(|field| (field.path, field.name)).collect();
+    let mut found = Tracked(None);
+    model.visit(&mut FieldVisitor::new(names, &mut found));
+    found.0
+}
+
+struct Tracked(Option<Tensor<2>>);
+
+impl VisitField for &mut Tracked {
+    fn visit<const D: usize>(&mut self, _: &str, param: &Param<Tensor<D>>) {
+        self.0 = Some(flat(param.val()));
     }
 }
 

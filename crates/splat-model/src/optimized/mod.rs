@@ -17,6 +17,7 @@ use crate::field::Field;
 use crate::opacity::logit;
 use crate::optimizer::{FieldOptimizer, MomentEdit, SplatAdam};
 use crate::{LearningRates, SplatModel};
+pub(crate) use fields::tracked_field;
 use fields::{FieldVisitor, GradientsOf, Paths, Untracked, ValuesOf, change};
 
 /// Gradients by field name, each `[N, width]`; dimensions beyond the first are flattened.

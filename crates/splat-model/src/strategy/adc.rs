@@ -2,18 +2,17 @@
 
 use burn::tensor::Device;
 use derive_setters::Setters;
-use glam::{DQuat, DVec3};
 use serde::{Deserialize, Serialize};
 use splat_ops::OpError;
 use tracing::trace_span;
 
 use super::relocation::relocate_logit;
 use super::screen_sums::ScreenSums;
+use super::splats::Splats;
 use super::{Refinement, ScreenWants, StepContext, StepInfo, Strategy, check_fields, draw};
-use crate::opacity::sigmoid;
 use crate::optimizer::StateRecord;
 use crate::rows::{Moments, RowEdit};
-use crate::{Field, Optimized, SplatModel};
+use crate::{Field, SplatModel};
 
 /// Settings of adaptive density control. Milestones are stated for a run of 30,000 steps and shrink
 /// with shorter runs. Intervals do not: statistics need their hundred views, and opacities their
@@ -89,51 +88,6 @@ impl Default for AdcSettings {
             prune_scale_start: 3_000,
             reset_opacity: 0.01,
             max_gaussians: None,
-        }
-    }
-}
-
-/// The numbers that are decided on, on the host.
-#[derive(Debug, Clone, Default)]
-pub(super) struct Splats {
-    means: Vec<[f64; 3]>,
-    log_scales: Vec<[f64; 3]>,
-    quats: Vec<[f64; 4]>,
-    opacity_logits: Vec<f64>,
-}
-
-impl Splats {
-    /// 11 numbers of each Gaussian.
-    pub(super) fn read<M: SplatModel>(model: &Optimized<M>) -> Result<Self, OpError> {
-        let [means, log_scales, quats, opacity_logits] =
-            model.read_f64(["means", "log_scales", "quats", "opacity_logits"])?;
-        Ok(Self {
-            means: means.as_chunks().0.to_vec(),
-            log_scales: log_scales.as_chunks().0.to_vec(),
-            quats: quats.as_chunks().0.to_vec(),
-            opacity_logits,
-        })
-    }
-
-    fn len(&self) -> usize {
-        self.means.len()
-    }
-
-    fn opacity(&self, row: usize) -> f64 {
-        sigmoid(self.opacity_logits[row])
-    }
-
-    /// A standard normal draw, as an offset from the mean of the Gaussian that it is a draw from.
-    fn sample(&self, row: usize, normal: [f64; 3]) -> [f64; 3] {
-        let scales = DVec3::from_array(self.log_scales[row]).exp();
-        let [w, x, y, z] = self.quats[row];
-        let rotation = DQuat::from_xyzw(x, y, z, w).normalize();
-        let offset = rotation * (scales * DVec3::from_array(normal));
-        // A quaternion without length has no axes to draw along.
-        if offset.is_finite() {
-            offset.to_array()
-        } else {
-            [0.0; 3]
         }
     }
 }
@@ -228,7 +182,7 @@ impl Adc {
         for row in &splits {
             for half in 0..2 {
                 let new = edit.push(*row, Moments::Restart);
-                edit.offset(new, "means", &splats.sample(*row, draw(*row, half)));
+                edit.offset(new, "means", &splats.offset(*row, draw(*row, half)));
                 edit.offset(new, "log_scales", &[smaller; 3]);
                 if self.settings.revised_opacity {
                     let old = splats.opacity_logits[*row];
@@ -374,6 +328,7 @@ fn revised(opacity: f64) -> f64 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::opacity::sigmoid;
 
     fn at(step: usize) -> StepInfo {
         let run = super::super::RunSchedule {

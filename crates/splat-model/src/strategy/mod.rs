@@ -4,15 +4,17 @@
 //! gradients, parameters and rows, and may edit rows ([`RowEdit`](crate::RowEdit)), add terms to
 //! the loss, pause and scale the steps of fields, set the first Gaussians and the size of the
 //! photos, and render other training views. [`Adc`] is that of 3DGS and AbsGS, [`Mcmc`] that of
-//! Kheradmand et al. 2024.
+//! Kheradmand et al. 2024, [`ImprovedGs`] those of Deng et al. 2025, Improved-GS and GNS.
 
 mod adc;
 mod draw;
+mod improved;
 mod mcmc;
 mod relocation;
 mod schedule;
 mod scores;
 mod screen_sums;
+mod splats;
 #[cfg(all(test, feature = "cpu"))]
 mod tests;
 
@@ -26,6 +28,7 @@ use crate::{
 };
 
 pub use adc::{Adc, AdcSettings};
+pub use improved::{ImprovedGs, ImprovedGsSettings, SelectionSettings};
 pub use mcmc::{Mcmc, McmcSettings};
 pub use relocation::relocate;
 pub use schedule::{RunSchedule, StepInfo};

@@ -1,6 +1,8 @@
 //! One refinement of each strategy against a PyTorch script (`tests/fixtures/strategies.py`):
 //! parameters and moments after it, from draws that are given.
 
+mod improved;
+
 use std::collections::BTreeMap;
 
 use burn::module::Param;
@@ -9,8 +11,9 @@ use splat_data::SceneScale;
 use splat_ops::AdamRows;
 use splat_test_support::{Reference, relative_error};
 
-use super::adc::{self, Adc, AdcSettings};
+use super::adc::{Adc, AdcSettings};
 use super::mcmc::{Mcmc, McmcSettings, Rows};
+use super::splats::Splats;
 use super::{RunSchedule, StepInfo};
 use crate::optimizer::StateRecord;
 use crate::rows::{Moments, RowEdit};
@@ -216,7 +219,7 @@ fn adc_agrees(name: &str) {
         .collect();
     for setup in setups() {
         let mut model = before(&file, &setup);
-        let splats = adc::Splats::read(&model).unwrap();
+        let splats = Splats::read(&model).unwrap();
         let strategy = Adc::new(settings.clone());
         let (edit, _) = strategy.plan_with(&at, &splats, &means, draw);
         let ours = kinds(&edit);

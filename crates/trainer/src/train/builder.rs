@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use burn::tensor::Device;
 use splat_data::{Capture, SceneScale, SplatData, View};
 use splat_model::optimizer::{FieldOptimizer, SplatAdam};
-use splat_model::strategy::{Adc, Mcmc, RunSchedule, Strategy};
+use splat_model::strategy::{Adc, ImprovedGs, Mcmc, RunSchedule, Strategy};
 use splat_model::{Field, Gaussians, Optimized, SplatModel};
 
 use super::checkpoint::RunRecord;
@@ -224,12 +224,14 @@ impl<M: SplatModel> TrainerBuilder<M> {
         // What transparent photos were composited on is behind the scene.
         config.background = config.background.or(self.capture.background);
         if config.max_gaussians().is_none() {
-            config.set_max_gaussians(default_max_gaussians(&self.capture));
+            let share = config.max_gaussians_share;
+            config.set_max_gaussians(default_max_gaussians(&self.capture, share));
         }
         let strategy = self.strategy.take();
         let strategy = strategy.unwrap_or_else(|| match config.strategy {
             StrategyKind::Adc => Box::new(Adc::new(config.density.clone())),
             StrategyKind::Mcmc => Box::new(Mcmc::new(config.mcmc.clone())),
+            StrategyKind::Improved => Box::new(ImprovedGs::new(config.improved.clone())),
         });
         let mut terms: Vec<String> = loss.names().map(str::to_owned).collect();
         terms.extend(strategy.loss_term_names());
@@ -308,8 +310,8 @@ impl<M: SplatModel> TrainerBuilder<M> {
     }
 }
 
-/// Poses and points adjusted to the keypoints of the capture, if poses are refined and the keypoints
-/// fit.
+/// Poses and points adjusted to the keypoints of the capture, if poses are refined and the
+/// keypoints fit.
 fn adjusted(
     capture: &Capture,
     config: &TrainSettings,

@@ -6,14 +6,15 @@ use splat_model::{InitSettings, splats_from_points};
 use super::TrainError;
 
 /// Default limit of Gaussians: seven for every ten pixels of a photo, or one for every hundred
-/// pixels of all training photos, whichever is more.
-pub(super) fn default_max_gaussians(capture: &Capture) -> usize {
+/// pixels of all training photos, whichever is more; and of that a share.
+pub(super) fn default_max_gaussians(capture: &Capture, share: f64) -> usize {
     let pixels = |view: &usize| {
         let view = &capture.views[*view];
         view.width as usize * view.height as usize
     };
     let photos = capture.split.train.iter().map(pixels);
-    (photos.clone().sum::<usize>() / 100).max(photos.max().unwrap_or(0) * 7 / 10)
+    let most = (photos.clone().sum::<usize>() / 100).max(photos.max().unwrap_or(0) * 7 / 10);
+    ((most as f64 * share) as usize).max(1)
 }
 
 /// One Gaussian per point of the capture, at these positions, relative to the origin.

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 
 use serde::{Deserialize, Serialize};
 use splat_model::ops::{AdamRows, ClampGradient, RasterizeSettings};
-use splat_model::strategy::{AdcSettings, McmcSettings};
+use splat_model::strategy::{AdcSettings, ImprovedGsSettings, McmcSettings};
 use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale};
 
 use splat_data::Capture;
@@ -45,8 +45,8 @@ pub struct TrainSettings {
     pub coarse_halvings: u32,
     /// Steps between two doublings of the sides, in a run of 30,000. Default 250.
     pub coarse_every: usize,
-    /// One more degree of spherical harmonics every so many steps of a run of 30,000. Default
-    /// 1,000.
+    /// One more degree of spherical harmonics every so many steps of a run of 30,000. Shorter runs
+    /// have fewer, though not fewer than one pass over the photos takes. Default 1,000.
     pub sh_degree_every: usize,
     /// Multiply opacities by what the low-pass filter took away. Default false.
     pub antialias: bool,
@@ -66,6 +66,9 @@ pub struct TrainSettings {
     /// Which Gaussians there are, where the trainer is given no strategy of its own. Default
     /// `adc`.
     pub strategy: StrategyKind,
+    /// Share of the limit that growth has where the strategy's `max_gaussians` is absent. Infinity
+    /// is no limit. Default 1.
+    pub max_gaussians_share: f64,
     /// The first Gaussians.
     pub init: InitSettings,
     /// Learning rates; called `rates` in older files.
@@ -78,6 +81,9 @@ pub struct TrainSettings {
     pub density: AdcSettings,
     /// The strategy `mcmc`. Where `max_gaussians` is absent, growth ends as it does for `density`.
     pub mcmc: McmcSettings,
+    /// The strategy `improved`. Where `max_gaussians` is absent, growth ends as it does for
+    /// `density`.
+    pub improved: ImprovedGsSettings,
     /// Refinement of the cameras. Default none.
     pub calibration: CalibrationSettings,
 }
@@ -92,6 +98,9 @@ pub enum StrategyKind {
     Adc,
     /// [`Mcmc`](splat_model::strategy::Mcmc).
     Mcmc,
+    /// [`ImprovedGs`](splat_model::strategy::ImprovedGs); with `improved.selection.final_gaussians`
+    /// that of GNS.
+    Improved,
 }
 
 impl TrainSettings {
@@ -117,10 +126,12 @@ impl Default for TrainSettings {
             seen_rows_only: false,
             deterministic: true,
             strategy: StrategyKind::default(),
+            max_gaussians_share: 1.0,
             init: InitSettings::default(),
             learning_rates: LearningRates::default(),
             density: AdcSettings::default(),
             mcmc: McmcSettings::default(),
+            improved: ImprovedGsSettings::default(),
             calibration: CalibrationSettings::default(),
         }
     }
@@ -153,6 +164,7 @@ impl TrainSettings {
         match self.strategy {
             StrategyKind::Adc => self.density.max_gaussians,
             StrategyKind::Mcmc => self.mcmc.max_gaussians,
+            StrategyKind::Improved => self.improved.max_gaussians,
         }
     }
 
@@ -161,6 +173,7 @@ impl TrainSettings {
         match self.strategy {
             StrategyKind::Adc => self.density.max_gaussians = Some(most),
             StrategyKind::Mcmc => self.mcmc.max_gaussians = Some(most),
+            StrategyKind::Improved => self.improved.max_gaussians = Some(most),
         }
     }
 
@@ -234,7 +247,14 @@ impl TrainSettings {
                     .to_owned(),
             );
         }
+        if !(self.max_gaussians_share > 0.0) {
+            let share = self.max_gaussians_share;
+            return Err(format!(
+                "`max_gaussians_share` must be above 0, it is {share}"
+            ));
+        }
         (self.mcmc.validate()).map_err(|problem| problem.replacen('`', "`mcmc.", 1))?;
+        (self.improved.validate()).map_err(|problem| problem.replacen('`', "`improved.", 1))?;
         (self.calibration.validate())
             .map_err(|problem| problem.replacen('`', "`calibration.", 1))?;
         if let Some(color) = self.background
@@ -339,6 +359,7 @@ impl TrainSettings {
             ("init.opacity", self.init.opacity),
             ("density.reset_opacity", self.density.reset_opacity),
             ("mcmc.init_opacity", self.mcmc.init_opacity),
+            ("improved.reset_opacity", self.improved.reset_opacity),
         ];
         if let Some((field, value)) = starts.iter().find(|(_, value)| *value <= cut) {
             return Err(format!(
@@ -468,8 +489,14 @@ mod tests {
         assert!(message.contains("`[density]`"), "{message}");
         let found = problem(&|config| config.mcmc.init_opacity = 0.001);
         assert!(found.contains("`mcmc.init_opacity`"), "{found}");
+        let found = problem(&|config| config.max_gaussians_share = f64::NAN);
+        assert!(found.contains("`max_gaussians_share`"), "{found}");
         let found = problem(&|config| config.mcmc.growth = 0.5);
         assert!(found.contains("`mcmc.growth`"), "{found}");
+        let found = problem(&|config| config.improved.reset_opacity = 0.003);
+        assert!(found.contains("`improved.reset_opacity`"), "{found}");
+        let found = problem(&|config| config.improved.selection.overgrowth = 0.5);
+        assert!(found.contains("`improved.selection.overgrowth`"), "{found}");
         assert_eq!(
             problem(&|config| config.density.split_scale = f64::INFINITY),
             ""

@@ -22,7 +22,7 @@ use super::training_views::CaptureViews;
 use super::watch::Watch;
 use super::{
     Checkpoint, LossTerms, TargetView, TrainError, TrainSettings, Warning, resolution_schedule,
-    views, warnings,
+    sh_schedule, views, warnings,
 };
 use crate::calibration::BundleAdjustment;
 use crate::hooks::{HookView, Purpose};
@@ -215,7 +215,7 @@ impl<M: SplatModel> Trainer<M> {
         let camera = view.camera().relative_to(model.origin());
         let cameras = CameraTensors::from_camera(&camera, &self.device);
         let cameras = hooks.cameras(&hook_view, cameras)?;
-        let settings = self.render_settings(at.step);
+        let settings = self.render_settings(at);
 
         let render = trace_span!("render").entered();
         let mut projected = project_gaussians(model, &cameras, &settings)?;
@@ -358,9 +358,8 @@ impl<M: SplatModel> Trainer<M> {
         })
     }
 
-    fn render_settings(&self, step: usize) -> RenderSettings {
-        let every = self.schedule.milestone(self.config.sh_degree_every);
-        let degree = (step / every).min(SH_DEGREE_MAX);
+    fn render_settings(&self, at: &StepInfo) -> RenderSettings {
+        let degree = sh_schedule::degree(&self.config, at, self.capture.split.train.len());
         self.config
             .render_settings(degree, self.schedule.scene_scale)
     }

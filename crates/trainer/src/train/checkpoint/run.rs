@@ -7,7 +7,12 @@ use super::super::fingerprint::Fingerprint;
 use super::{Checkpoint, CheckpointError};
 
 /// Settings that a resumed run may change: its length, and the limits of growth.
-const CHANGEABLE: [&str; 3] = ["steps", "density.max_gaussians", "mcmc.max_gaussians"];
+const CHANGEABLE: [&str; 4] = [
+    "steps",
+    "density.max_gaussians",
+    "mcmc.max_gaussians",
+    "improved.max_gaussians",
+];
 
 /// A run without its state: its settings and its capture.
 #[derive(Debug, Clone, Serialize, Deserialize)]
@@ -38,6 +43,7 @@ impl Checkpoint {
         same.steps = self.settings().steps;
         same.density.max_gaussians = self.settings().density.max_gaussians;
         same.mcmc.max_gaussians = self.settings().mcmc.max_gaussians;
+        same.improved.max_gaussians = self.settings().improved.max_gaussians;
         if let Some(difference) = self.settings().difference_in_words(&same) {
             return Err(CheckpointError::OtherSettings {
                 path: self.path.clone(),
