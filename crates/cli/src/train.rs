@@ -94,7 +94,7 @@ pub struct TrainArgs {
 }
 
 /// Values of `--recipe`.
-fn recipe_names() -> PossibleValuesParser {
+pub(super) fn recipe_names() -> PossibleValuesParser {
     PossibleValuesParser::new(RECIPES.iter().map(|recipe| recipe.name))
 }
 
@@ -267,8 +267,15 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     let trainer = shown(trainer, &progress).build()?;
     if let Some(adjusted) = trainer.bundle_adjustment().filter(|_| fresh) {
         global.say(format_args!(
-            "poses adjusted to {} keypoints: {:.2} pixels off in the median, {:.2} before",
-            adjusted.keypoints, adjusted.error_after, adjusted.error_before
+            "poses adjusted to {} keypoints{}: {:.2} pixels off in the median, {:.2} before",
+            adjusted.keypoints,
+            if adjusted.matched {
+                " found in the photos"
+            } else {
+                ""
+            },
+            adjusted.error_after,
+            adjusted.error_before
         ));
     }
 

@@ -4,6 +4,8 @@
 
 #[path = "program/files.rs"]
 mod files;
+#[path = "program/recipes.rs"]
+mod recipes;
 #[path = "program/runs.rs"]
 #[cfg(unix)]
 mod runs;

@@ -4,6 +4,7 @@ mod accuracy;
 mod input;
 mod performance;
 mod rasterize;
+mod recipes;
 mod scaling;
 mod step;
 
@@ -23,7 +24,8 @@ use crate::report::{probe_file, write_atomically};
   splat bench accuracy --report docs
   splat bench step photos/ --downscale 2
   splat bench step photos/ --downscale 2 --device wgpu
-  splat bench performance --report docs")]
+  splat bench performance --report docs
+  splat bench recipes photos/ --downscale 4 --steps 7000")]
 pub struct BenchArgs {
     #[command(subcommand)]
     bench: Bench,
@@ -38,6 +40,7 @@ enum Bench {
     Scaling(scaling::ScalingArgs),
     Capture(scaling::SyntheticArgs),
     Performance(performance::PerformanceArgs),
+    Recipes(recipes::RecipesArgs),
     Point(scaling::PointArgs),
 }
 
@@ -50,6 +53,7 @@ pub(super) fn run(args: &BenchArgs, global: &GlobalArgs) -> Result<(), Failure> 
         Bench::Scaling(args) => scaling::run(args, global),
         Bench::Capture(args) => scaling::run_synthetic(args),
         Bench::Performance(args) => performance::run(args, global),
+        Bench::Recipes(args) => recipes::run(args, global),
         Bench::Point(args) => scaling::run_point(args, global),
     }
 }

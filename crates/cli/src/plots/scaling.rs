@@ -187,7 +187,7 @@ fn widened(values: impl Iterator<Item = f64>) -> Option<Range<f64>> {
 }
 
 /// 10, 100, 10k, 2M.
-fn short(value: f64) -> String {
+pub(crate) fn short(value: f64) -> String {
     match value {
         v if v >= 1e6 => format!("{}M", v / 1e6),
         v if v >= 1e3 => format!("{}k", v / 1e3),

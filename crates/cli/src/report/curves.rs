@@ -159,7 +159,7 @@ fn thinned(points: &[(usize, f64)]) -> Vec<(f64, f64)> {
 
 /// Range of `values`, a twentieth wider on each side and never empty; `None` if there are no
 /// values.
-fn padded(values: impl Iterator<Item = f64>) -> Option<Range<f64>> {
+pub(crate) fn padded(values: impl Iterator<Item = f64>) -> Option<Range<f64>> {
     let (least, most) = values.fold((f64::INFINITY, f64::NEG_INFINITY), |range, value| {
         (range.0.min(value), range.1.max(value))
     });

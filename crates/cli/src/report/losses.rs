@@ -34,7 +34,7 @@ fn csv(history: &History) -> String {
 }
 
 /// A field quoted for readers of RFC 4180.
-fn quoted(name: &str) -> String {
+pub(crate) fn quoted(name: &str) -> String {
     if name.contains([',', '"', '\n', '\r']) {
         format!("\"{}\"", name.replace('"', "\"\""))
     } else {

@@ -353,14 +353,14 @@ fn a_full_disk_takes_no_more_than_it_must() {
 
     // Room for a scene, not for a checkpoint.
     let run = training(&capture, "no_autosave", &[&SMALL[..], &steps].concat());
-    succeed(&limited(&run, scene * 3 / 2).output().unwrap());
+    succeed(&limited(&run, scene * 5 / 4).output().unwrap());
     // Every autosave fails, and is reported once.
     let run = training(
         &capture,
         "scene",
         &[&SMALL[..], &steps, &["--autosave", "0"]].concat(),
     );
-    let output = limited(&run, scene * 3 / 2).output().unwrap();
+    let output = limited(&run, scene * 5 / 4).output().unwrap();
     succeed(&output);
     let said = stderr(&output);
     assert_eq!(said.matches("could not be saved").count(), 1, "{said}");
@@ -386,7 +386,7 @@ fn a_full_disk_takes_no_more_than_it_must() {
     let endless = ["--steps", "100000", "--autosave", "0"];
     let run = training(&capture, "stopped", &[&SMALL[..], &endless].concat());
     let log = folder.path().join("log");
-    let mut child = limited(&run, scene * 3 / 2)
+    let mut child = limited(&run, scene * 5 / 4)
         .stderr(fs::File::create(&log).unwrap())
         .spawn()
         .unwrap();

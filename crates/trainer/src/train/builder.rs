@@ -16,6 +16,7 @@ use super::commands::{Command, Commands};
 use super::fingerprint::Fingerprint;
 use super::first::{default_max_gaussians, first_gaussians};
 use super::loss_log::LossLog;
+use super::spectrum::Spectrum;
 use super::state::State;
 use super::trainer::Trainer;
 use super::watch::{Autosave, Watch};
@@ -204,7 +205,11 @@ impl<M: SplatModel> TrainerBuilder<M> {
         let loss = loss.unwrap_or_else(|| LossTerms::l1_ssim(self.config.ssim_weight));
         let schedule = schedule(&self.capture, &self.config)?;
         let device = self.device.without_autodiff().autodiff();
-        let adjusted = adjusted(&self.capture, &self.config, &mut self.watch);
+        let spectrum = match self.config.spectral_resolution {
+            true => Some(Spectrum::of(&self.capture)?),
+            false => None,
+        };
+        let adjusted = adjusted(&self.capture, &self.config, &mut self.watch)?;
         let calibrating = calibration(
             &self.capture,
             &self.config,
@@ -304,6 +309,7 @@ impl<M: SplatModel> TrainerBuilder<M> {
             record,
             losses: LossLog::default(),
             in_step: false,
+            spectrum,
             adjusted,
             coarse: resolution_schedule::CoarseViews::default(),
         })
@@ -316,18 +322,25 @@ fn adjusted(
     capture: &Capture,
     config: &TrainSettings,
     watch: &mut Watch,
-) -> Option<BundleAdjustment> {
+) -> Result<Option<BundleAdjustment>, TrainError> {
     let settings = &config.calibration;
     if !(settings.poses && settings.bundle_adjustment) {
-        return None;
+        return Ok(None);
     }
-    let adjusted = adjust_bundle(capture)?;
+    let Some(adjusted) = adjust_bundle(capture)? else {
+        return Ok(None);
+    };
     if !adjusted.fits {
         let [before, after] = [adjusted.error_before, adjusted.error_after];
-        (watch.on_warning)(&Warning::KeypointsDoNotFit { before, after });
-        return None;
+        let matched = adjusted.matched;
+        (watch.on_warning)(&Warning::KeypointsDoNotFit {
+            matched,
+            before,
+            after,
+        });
+        return Ok(None);
     }
-    Some(adjusted)
+    Ok(Some(adjusted))
 }
 
 /// The hooks that refine the cameras, as far as the settings want it.

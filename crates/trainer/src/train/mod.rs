@@ -16,6 +16,7 @@ mod resolution_schedule;
 mod run;
 mod settings;
 mod sh_schedule;
+mod spectrum;
 mod state;
 mod trainer;
 mod training_views;

@@ -24,6 +24,9 @@ pub struct Progress<'a> {
     pub steps: usize,
     /// Number of Gaussians.
     pub gaussians: usize,
+    /// Time spent in steps so far, over all sessions of the run; measuring held-out views and
+    /// saving are not part of it.
+    pub elapsed: Duration,
     /// Log so far; losses lag behind by up to [`LOSS_BATCH`](super::LOSS_BATCH) steps.
     pub history: &'a History,
 }

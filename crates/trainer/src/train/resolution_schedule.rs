@@ -5,10 +5,15 @@ use std::collections::HashMap;
 use splat_model::strategy::StepInfo;
 
 use super::TrainSettings;
+use super::spectrum::Spectrum;
 use splat_data::{Capture, View};
 
 /// Divisor of the photos at a step.
-pub(super) fn factor(config: &TrainSettings, at: &StepInfo) -> u32 {
+pub(super) fn factor(config: &TrainSettings, spectrum: Option<&Spectrum>, at: &StepInfo) -> u32 {
+    if let Some(spectrum) = spectrum {
+        let grown = at.run.milestone(config.spectral_until);
+        return spectrum.divisor(at.step as f64 / grown as f64);
+    }
     let stages = at.step / at.run.milestone(config.coarse_every);
     let left = (config.coarse_halvings as usize).saturating_sub(stages);
     1 << left
@@ -60,7 +65,7 @@ mod tests {
                 scene_scale: SceneScale::new(1.0).unwrap(),
                 seed: 0,
             };
-            at.map(|step| factor(&config, &StepInfo { step, run }))
+            at.map(|step| factor(&config, None, &StepInfo { step, run }))
         };
         let expected = [4, 4, 2, 2, 1, 1];
         assert_eq!(factors(30_000, [0, 249, 250, 499, 500, 29_999]), expected);
@@ -71,7 +76,7 @@ mod tests {
             seed: 0,
         };
         assert_eq!(
-            factor(&TrainSettings::default(), &StepInfo { step: 0, run }),
+            factor(&TrainSettings::default(), None, &StepInfo { step: 0, run }),
             1
         );
     }

@@ -75,6 +75,7 @@ impl<M: SplatModel> Trainer<M> {
             step,
             steps,
             gaussians: self.state.model.model().count(),
+            elapsed: self.state.elapsed,
             history: &self.state.history,
         });
         Ok(())

@@ -45,6 +45,13 @@ pub struct TrainSettings {
     pub coarse_halvings: u32,
     /// Steps between two doublings of the sides, in a run of 30,000. Default 250.
     pub coarse_every: usize,
+    /// Training begins with small photos, which grow as their spectra ask for: the logarithm of the
+    /// share of frequencies that they show rises in proportion to the steps (DashGaussian, section
+    /// 4.1). Instead of `coarse_halvings`. Default false.
+    pub spectral_resolution: bool,
+    /// Milestone: photos are as they are from this step on, with `spectral_resolution`. Default
+    /// 15,000.
+    pub spectral_until: usize,
     /// One more degree of spherical harmonics every so many steps of a run of 30,000. Shorter runs
     /// have fewer, though not fewer than one pass over the photos takes. Default 1,000.
     pub sh_degree_every: usize,
@@ -119,6 +126,8 @@ impl Default for TrainSettings {
             views_per_step: 1,
             coarse_halvings: 0,
             coarse_every: 250,
+            spectral_resolution: false,
+            spectral_until: 15_000,
             sh_degree_every: 1_000,
             antialias: false,
             background: None,
@@ -244,6 +253,12 @@ impl TrainSettings {
         {
             return Err(
                 "`init.opacity` and `init.scale` have no effect with the strategy mcmc; set `mcmc.init_opacity` and `mcmc.init_scale`"
+                    .to_owned(),
+            );
+        }
+        if self.spectral_resolution && self.coarse_halvings > 0 {
+            return Err(
+                "`spectral_resolution` and `coarse_halvings` both say how photos grow; give one"
                     .to_owned(),
             );
         }
@@ -489,6 +504,10 @@ mod tests {
         assert!(message.contains("`[density]`"), "{message}");
         let found = problem(&|config| config.mcmc.init_opacity = 0.001);
         assert!(found.contains("`mcmc.init_opacity`"), "{found}");
+        let found = problem(&|config| {
+            (config.spectral_resolution, config.coarse_halvings) = (true, 1);
+        });
+        assert!(found.contains("`spectral_resolution`"), "{found}");
         let found = problem(&|config| config.max_gaussians_share = f64::NAN);
         assert!(found.contains("`max_gaussians_share`"), "{found}");
         let found = problem(&|config| config.mcmc.growth = 0.5);

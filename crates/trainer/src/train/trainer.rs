@@ -17,6 +17,7 @@ use tracing::trace_span;
 
 use super::checkpoint::RunRecord;
 use super::loss_log::{LossLog, ReadLoss, UnreadLoss, check_finite};
+use super::spectrum::Spectrum;
 use super::state::State;
 use super::training_views::CaptureViews;
 use super::watch::Watch;
@@ -62,6 +63,8 @@ pub struct Trainer<M: SplatModel = Gaussians> {
     /// Whether a step is half done.
     pub(super) in_step: bool,
     pub(super) coarse: resolution_schedule::CoarseViews,
+    /// Of the photos, if their sizes follow from it.
+    pub(super) spectrum: Option<Spectrum>,
     pub(super) adjusted: Option<BundleAdjustment>,
 }
 
@@ -202,7 +205,9 @@ impl<M: SplatModel> Trainer<M> {
     ) -> Result<Measured, TrainError> {
         let index = self.capture.split.train[training_index];
         let factor = self.state.strategy.photo_factor(at);
-        let factor = factor.unwrap_or_else(|| resolution_schedule::factor(&self.config, at));
+        let spectrum = self.spectrum.as_ref();
+        let factor =
+            factor.unwrap_or_else(|| resolution_schedule::factor(&self.config, spectrum, at));
         let view = self.coarse.view(&self.capture, index, factor.max(1));
         let view = view.loaded()?;
         let model = self.state.model.model();

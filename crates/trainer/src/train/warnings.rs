@@ -82,8 +82,10 @@ pub enum Warning {
         /// Their names.
         views: Vec<String>,
     },
-    /// The keypoints of the capture disagree with its photos and cameras.
+    /// The keypoints disagree with the photos and cameras.
     KeypointsDoNotFit {
+        /// True if they were looked for in the photos, false if they are the capture's.
+        matched: bool,
         /// Their median distance from the projected points, pixels.
         before: f64,
         /// The least that poses and points can reach.
@@ -231,9 +233,13 @@ impl fmt::Display for Warning {
                 "{}: the photo has other pixels than the one that the run was begun with; it goes on with those there are now",
                 Names(views)
             ),
-            Self::KeypointsDoNotFit { before, after } => write!(
+            Self::KeypointsDoNotFit { matched: true, .. } => write!(
                 f,
-                "the keypoints of the model are not those of these photos or cameras: {before:.2} pixels off in the median, and {after:.2} at best; poses are refined by the photos alone"
+                "the photos have too few corners in common for a bundle adjustment; poses are refined by gradients of the photos alone"
+            ),
+            Self::KeypointsDoNotFit { before, after, .. } => write!(
+                f,
+                "the keypoints do not fit these photos and cameras: they are {before:.2} pixels off in the median, and {after:.2} at best; poses are refined by gradients of the photos alone"
             ),
             Self::NotSaved { step, reason } => write!(
                 f,

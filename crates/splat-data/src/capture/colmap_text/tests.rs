@@ -185,7 +185,7 @@ fn records_end_where_they_should() {
     for track in ["", " 0.5", " 0.5 1 2", " 0.5 1 2 3 4"] {
         let listed = points(&format!("\u{feff}{head}9 0 1 2 3 4 5{track}\n")).unwrap();
         assert_eq!(
-            (listed.records[0].color, listed.announced),
+            (listed.records[0].point.color, listed.announced),
             ([3, 4, 5], Some(2))
         );
     }

@@ -1,18 +1,23 @@
-//! Bundle adjustment: poses and points that agree best with the keypoints of the capture.
+//! Bundle adjustment: poses and points that agree best with keypoints of the photos.
 //!
 //! Gradients of the photos find the pose of a single view, but scene and cameras can bend together
-//! at little cost, and descent follows such a bend slowly. The keypoints that structure from motion
-//! matched tie all views together, and the least squares of their reprojection errors are solved to
-//! the end in seconds (Triggs et al. 2000, "Bundle Adjustment: A Modern Synthesis"): by
-//! Levenberg's and Marquardt's method, with Huber's loss, first for each pose by itself, then for
-//! poses and points together.
+//! at little cost, and descent follows such a bend slowly. Points that several photos show tie the
+//! views together. The least squares of their reprojection errors are solved to the end in seconds
+//! (Triggs et al. 2000, "Bundle Adjustment: A Modern Synthesis"): by Levenberg's and Marquardt's
+//! method, with Huber's loss.
+//!
+//! The keypoints are those of structure from motion where the capture has them, and are looked for
+//! in the photos where it has none.
 
+mod matching;
 mod normal;
+mod picture;
 mod problem;
 
 use glam::{DMat4, DVec3, DVec4};
-use splat_data::{Capture, View};
+use splat_data::{Capture, CaptureError, View};
 
+use matching::Photos;
 use problem::{Cost, Problem, Unknowns};
 
 /// Fewest keypoints that fix a pose.
@@ -26,6 +31,11 @@ const CONVERGED: f64 = 1e-7;
 const LARGEST_ERROR: f64 = 0.003;
 /// Huber's loss is quadratic up to this many times the median error.
 const QUADRATIC: f64 = 3.0;
+/// Corners are looked for this far from where they should be, as shares of the longer side: first
+/// with the poses of the capture, then with better ones.
+const REACHES: [f64; 3] = [1.0 / 20.0, 1.0 / 60.0, 1.0 / 60.0];
+/// A match with an error of so many times the median is wrong.
+const OUTLIER: f64 = 6.0;
 
 /// Poses and points after [`adjust_bundle`].
 #[derive(Debug, Clone, PartialEq)]
@@ -34,66 +44,142 @@ pub struct BundleAdjustment {
     /// fewer than twelve keypoints are unchanged.
     pub viewmats: Vec<DMat4>,
     /// Positions of the capture's points. Those that fewer than two training views observe are
-    /// unchanged.
+    /// unchanged, and so are all if the keypoints were [`matched`](Self::matched).
     pub points: Vec<[f64; 3]>,
     /// Keypoints that were used.
     pub keypoints: usize,
+    /// True if the capture has no keypoints of its own, and corners of its photos were taken.
+    pub matched: bool,
     /// Median distance of keypoints and projected points before, in pixels.
     pub error_before: f64,
     /// The same after.
     pub error_after: f64,
     /// True if the keypoints agree: the error after is no larger than before, and at most 0.3 % of
-    /// the photo's longer side. If false, they are those of other photos or of a lens that is not
-    /// the capture's, and poses and points should not be taken over.
+    /// the photo's longer side. Matched ones must also be found anew where the adjusted poses have
+    /// them, within the same bound. If false, they are those of other photos, of a lens that is not
+    /// the capture's, or wrong matches, and poses and points should not be taken over.
     pub fits: bool,
 }
 
-/// Adjusts the poses of the training views, and the points, to the keypoints of
-/// [`Capture::observations`]. Intrinsics stay as they are. Held-out views take no part: nothing may
-/// be learned from them.
+/// Adjusts the poses of the training views to the keypoints of [`Capture::observations`], and the
+/// points too: first each pose by itself, then poses and points together. Intrinsics stay as they
+/// are. Held-out views take no part: nothing may be learned from them.
 ///
-/// `None` if the capture has no keypoints, as when
+/// A capture without keypoints, as one whose
 /// [`CaptureSettings::observations`](splat_data::CaptureSettings::observations) did not ask for
-/// them, or no view has enough.
+/// them, gets some: corners of its photos, found again in neighbouring photos by correlation,
+/// within a twentieth of the photo's longer side from where poses and points have them.
+///
+/// `None` if no view has enough keypoints.
 ///
 /// ```
 /// use splat_data::{Capture, CaptureSettings};
 /// use splat_trainer::calibration::adjust_bundle;
 ///
 /// # let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
-/// let settings = CaptureSettings::new().with_downscale(8).with_observations(true);
+/// let settings = CaptureSettings::new().with_downscale(4).with_observations(true);
 /// let capture = Capture::load(folder, &settings)?;
-/// if let Some(adjusted) = adjust_bundle(&capture) {
+/// if let Some(adjusted) = adjust_bundle(&capture)? {
 ///     println!("{:.2} to {:.2} pixels", adjusted.error_before, adjusted.error_after);
 /// }
 /// # Ok::<(), splat_data::CaptureError>(())
 /// ```
-pub fn adjust_bundle(capture: &Capture) -> Option<BundleAdjustment> {
+///
+/// # Errors
+/// When a photo on the disk cannot be read.
+pub fn adjust_bundle(capture: &Capture) -> Result<Option<BundleAdjustment>, CaptureError> {
     let views: Vec<&View> = capture.train_views().collect();
-    let problem = Problem::new(capture, &views)?;
-    let mut unknowns = Unknowns {
+    let points = capture.points.iter().map(|p| DVec3::from_array(p.position));
+    let unknowns = Unknowns {
         viewmats: views.iter().map(|view| viewmat(view)).collect(),
-        points: (capture.points.iter())
-            .map(|point| DVec3::from_array(point.position))
-            .collect(),
+        points: points.collect(),
     };
-    let before = problem.errors(&unknowns);
+    match capture.observations.is_empty() {
+        false => Ok(of_observations(capture, &views, unknowns)),
+        true => of_corners(&views, unknowns),
+    }
+}
+
+fn of_observations(
+    capture: &Capture,
+    views: &[&View],
+    mut unknowns: Unknowns,
+) -> Option<BundleAdjustment> {
+    let problem = Problem::of_capture(capture, views)?;
+    let before = problem.errors(&unknowns).median();
     for free_points in [false, true] {
         minimize(&problem, &mut unknowns, free_points);
     }
-    let after = problem.errors(&unknowns);
-    let longer = views.iter().map(|view| view.width.max(view.height)).max();
-    let [error_before, error_after] = [before.median(), after.median()];
-    Some(BundleAdjustment {
-        viewmats: unknowns.viewmats,
-        points: unknowns.points.iter().map(DVec3::to_array).collect(),
+    let points = unknowns.points.iter().map(DVec3::to_array).collect();
+    Some(result(&problem, &unknowns, before, views).with_points(points, false))
+}
+
+fn of_corners(views: &[&View], start: Unknowns) -> Result<Option<BundleAdjustment>, CaptureError> {
+    let mut photos = Photos::of(views)?;
+    let mut viewmats = start.viewmats;
+    let mut adjusted: Option<BundleAdjustment> = None;
+    for reach in REACHES {
+        photos.place(&viewmats);
+        let matched = photos.matched(&start.points, reach);
+        let mut unknowns = Unknowns {
+            viewmats,
+            points: matched.points,
+        };
+        let Some(problem) = Problem::new(views, unknowns.points.len(), matched.sights) else {
+            return Ok(None);
+        };
+        let before = problem.errors(&unknowns).median();
+        minimize(&problem, &mut unknowns, true);
+        let Some(problem) = problem.without_outliers(&unknowns, OUTLIER) else {
+            return Ok(None);
+        };
+        minimize(&problem, &mut unknowns, true);
+        let next = result(&problem, &unknowns, before, views);
+        adjusted = Some(BundleAdjustment {
+            // Wrong matches agree with the poses that follow from them, but new ones do not.
+            fits: next.fits && before <= bound(views),
+            error_before: adjusted.map_or(before, |first| first.error_before),
+            ..next
+        });
+        viewmats = unknowns.viewmats;
+    }
+    let points = start.points.iter().map(DVec3::to_array).collect();
+    Ok(adjusted.map(|adjusted| adjusted.with_points(points, true)))
+}
+
+fn result(
+    problem: &Problem<'_>,
+    unknowns: &Unknowns,
+    error_before: f64,
+    views: &[&View],
+) -> BundleAdjustment {
+    let error_after = problem.errors(unknowns).median();
+    BundleAdjustment {
+        viewmats: unknowns.viewmats.clone(),
+        points: vec![],
         keypoints: problem.sights.len(),
+        matched: false,
         error_before,
         error_after,
         // Not so with NaN.
-        fits: error_after <= error_before
-            && error_after <= LARGEST_ERROR * f64::from(longer.unwrap_or(0)),
-    })
+        fits: error_after <= error_before && error_after <= bound(views),
+    }
+}
+
+/// The largest median error of keypoints that fit, in pixels.
+fn bound(views: &[&View]) -> f64 {
+    let longer = views.iter().map(|view| view.width.max(view.height)).max();
+    LARGEST_ERROR * f64::from(longer.unwrap_or(0))
+}
+
+impl BundleAdjustment {
+    fn with_points(self, points: Vec<[f64; 3]>, matched: bool) -> Self {
+        Self {
+            points,
+            matched,
+            ..self
+        }
+    }
 }
 
 fn viewmat(view: &View) -> DMat4 {

@@ -16,7 +16,7 @@ pub(super) struct Sight {
     /// Index among the points.
     pub point: usize,
     /// On the image plane.
-    position: [f64; 2],
+    pub position: [f64; 2],
 }
 
 /// The keypoints to agree with.
@@ -134,8 +134,8 @@ pub(super) struct Linearized {
 }
 
 impl<'a> Problem<'a> {
-    /// The keypoints of training views that have enough of them, of points that two views share.
-    pub fn new(capture: &Capture, views: &[&'a View]) -> Option<Self> {
+    /// The keypoints of a capture, as far as its training views have them.
+    pub fn of_capture(capture: &Capture, views: &[&'a View]) -> Option<Self> {
         let mut index_of = vec![None; capture.views.len()];
         for (index, view) in capture.split.train.iter().enumerate() {
             index_of[*view] = Some(index);
@@ -151,6 +151,12 @@ impl<'a> Problem<'a> {
             })
             .collect();
         sights.sort_by_key(|sight| (sight.point, sight.view));
+        Self::new(views, capture.points.len(), sights)
+    }
+
+    /// Keypoints, sorted by point, of views that have enough of them and of points that two views
+    /// share.
+    pub fn new(views: &[&'a View], points: usize, mut sights: Vec<Sight>) -> Option<Self> {
         // Each may leave too few of the other behind.
         loop {
             let before = sights.len();
@@ -179,9 +185,19 @@ impl<'a> Problem<'a> {
         Some(Self {
             sights,
             views: views.len(),
-            points: capture.points.len(),
+            points,
             cameras: views.iter().map(camera).collect(),
         })
+    }
+
+    /// The same without keypoints whose error is many times that of the others.
+    pub fn without_outliers(&self, unknowns: &Unknowns, times: f64) -> Option<Self> {
+        let errors = self.errors(unknowns);
+        let most = times * errors.median();
+        let kept = self.sights.iter().zip(&errors.0);
+        let kept = kept.filter(|(_, error)| **error <= most);
+        let views: Vec<&'a View> = self.cameras.iter().map(|camera| camera.view).collect();
+        Self::new(&views, self.points, kept.map(|(sight, _)| *sight).collect())
     }
 
     fn seen(&self, sight: &Sight, unknowns: &Unknowns) -> DVec3 {

@@ -1,7 +1,7 @@
 //! Runs that refine their cameras, and masks.
 
 use glam::{DMat4, DVec3};
-use splat_data::Lens;
+use splat_data::{Lens, Observation};
 use splat_model::Camera;
 
 use super::*;
@@ -65,6 +65,119 @@ fn nothing_is_refined_that_was_not_asked_for() {
     let capture = capture();
     let before: Vec<Camera> = capture.views.iter().map(|view| view.camera()).collect();
     assert_eq!(trained.cameras(&capture).unwrap(), before);
+}
+
+/// The capture with keypoints at which its photos show its points, and every training pose turned
+/// by a degree.
+fn turned_with_keypoints() -> Capture {
+    let mut turned = Capture::clone(&capture());
+    for (view, seen) in turned.views.iter().enumerate() {
+        let [fx, fy, cx, cy] = seen.intrinsics;
+        for (point, there) in turned.points.iter().enumerate().step_by(40) {
+            if let Some(([x, y], _)) = seen.project(there.position) {
+                turned.observations.push(Observation {
+                    view: view as u32,
+                    point: point as u32,
+                    position: [(x - cx) / fx, (y - cy) / fy],
+                });
+            }
+        }
+    }
+    let turn = DMat4::from_axis_angle(DVec3::new(1.0, -2.0, 1.0).normalize(), 1f64.to_radians());
+    for view in turned.split.train.clone() {
+        let view = &mut turned.views[view];
+        let camera = view.camera();
+        *view = view.with_pose(&Camera {
+            viewmat: turn * camera.viewmat,
+            ..camera
+        });
+    }
+    turned
+}
+
+/// Largest angle between poses of training views and those of the capture, in degrees.
+fn largest_turn(trained: &Trained, turned: &Capture) -> f64 {
+    let truth = capture();
+    let cameras = trained.cameras(turned).unwrap();
+    let angle = |index: &usize| {
+        let before = truth.views[*index].camera().viewmat;
+        let turn = glam::DMat3::from_mat4(cameras[*index].viewmat * before.inverse());
+        (glam::DQuat::from_mat3(&turn).to_axis_angle().1).to_degrees()
+    };
+    turned.split.train.iter().map(angle).fold(0.0, f64::max)
+}
+
+#[test]
+fn poses_begin_where_the_keypoints_are() {
+    let turned = Arc::new(turned_with_keypoints());
+    let run = |bundle: bool, stop: Option<usize>, resume: Option<Checkpoint>| {
+        let calibration = CalibrationSettings::new()
+            .with_poses(true)
+            .with_bundle_adjustment(bundle);
+        let settings = TrainSettings::new()
+            .with_steps(8)
+            .with_calibration(calibration);
+        let mut builder = builder_on(turned.clone()).settings(settings);
+        if let Some(checkpoint) = resume {
+            builder = builder.resume(checkpoint);
+        }
+        if let Some(stop) = stop {
+            let flag = Arc::new(AtomicBool::new(false));
+            let seen = flag.clone();
+            builder = builder.interrupt(flag).on_progress(move |progress| {
+                seen.store(progress.step >= stop, Ordering::Relaxed);
+            });
+        }
+        let trainer = builder.build().unwrap();
+        let adjusted = trainer.bundle_adjustment().cloned();
+        assert_eq!(adjusted.is_some(), bundle);
+        assert!(adjusted.is_none_or(|adjusted| adjusted.fits));
+        trainer.run().unwrap()
+    };
+    let trained = run(true, None, None);
+    let (with, without) = (
+        largest_turn(&trained, &turned),
+        largest_turn(&run(false, None, None), &turned),
+    );
+    assert!(with < 0.01, "{with}");
+    assert!(without > 0.8, "{without}");
+    // A run that goes on has the poses of its checkpoint, and their rate.
+    let half = run(true, Some(5), None);
+    assert_eq!(half.steps, 5);
+    let resumed = run(true, None, Some(half.checkpoint().unwrap()));
+    let cameras = |trained: &Trained| trained.cameras(&turned).unwrap();
+    assert_eq!(cameras(&resumed), cameras(&trained));
+    assert_eq!(resumed.model.to_data().means, trained.model.to_data().means);
+}
+
+#[test]
+fn keypoints_of_other_photos_are_left_aside() {
+    let mut other = turned_with_keypoints();
+    let count = other.observations.len();
+    for i in 0..count {
+        other.observations[i].position = other.observations[(i + 997) % count].position;
+    }
+    let calibration = CalibrationSettings::new().with_poses(true);
+    let settings = TrainSettings::new()
+        .with_steps(1)
+        .with_calibration(calibration);
+    let warnings = Arc::new(Mutex::new(Vec::new()));
+    let said = warnings.clone();
+    let trainer = builder_on(Arc::new(other))
+        .settings(settings)
+        .on_warning(move |warning| said.lock().unwrap().push(warning.clone()))
+        .build()
+        .unwrap();
+    assert!(trainer.bundle_adjustment().is_none());
+    let warnings = warnings.lock().unwrap();
+    assert!(
+        matches!(&warnings[..], [Warning::KeypointsDoNotFit { matched: false, before, after }] if after <= before),
+        "{warnings:?}"
+    );
+    assert!(
+        warnings[0].to_string().contains("pixels off"),
+        "{warnings:?}"
+    );
 }
 
 #[test]

@@ -1,0 +1,305 @@
+//! The runs to make, in turns, and which of them are missing.
+
+use std::path::{Path, PathBuf};
+
+use super::pictures;
+use super::row::{Key, Row, digest};
+use crate::report::refuse_inputs;
+use crate::{Failure, GlobalArgs, photos};
+use splat_data::{Capture, CaptureSettings};
+use splat_trainer::{Recipe, TrainSettings};
+
+/// Recipes, captures and seeds.
+pub(super) struct Plan {
+    pub captures: Vec<Subject>,
+    pub recipes: Vec<Recipe>,
+    /// Number of seeds, from 0 on.
+    pub seeds: u64,
+    /// Steps of a run, if they are not the recipe's.
+    pub steps: Option<usize>,
+    /// Factor by which photos are area-averaged.
+    pub downscale: u32,
+    /// Name of the device.
+    pub device: String,
+}
+
+/// A capture to train on.
+pub(super) struct Subject {
+    pub name: String,
+    pub folder: PathBuf,
+}
+
+/// A run to make.
+pub(super) struct Run {
+    /// Index of its capture in [`Plan::captures`].
+    pub capture: usize,
+    pub recipe: Recipe,
+    pub key: Key,
+}
+
+impl Plan {
+    /// A plan without captures. Settings that cannot be used are refused.
+    pub(super) fn new(
+        recipes: Vec<Recipe>,
+        seeds: u64,
+        steps: Option<usize>,
+        downscale: u32,
+    ) -> Result<Self, Failure> {
+        for recipe in &recipes {
+            let settings = settings(recipe, steps, downscale, 0);
+            settings.validate().map_err(|problem| {
+                Failure::BadInput(format!("settings of {}: {problem}", recipe.name))
+            })?;
+        }
+        Ok(Self {
+            captures: Vec::new(),
+            recipes,
+            seeds,
+            steps,
+            downscale,
+            device: String::new(),
+        })
+    }
+
+    /// Takes the captures in these folders, and checks what can be checked without decoding their
+    /// photos, so that the last of them is not found unusable after hours. Results go to `out`.
+    pub(super) fn take_captures(&mut self, folders: &[PathBuf], out: &Path) -> Result<(), Failure> {
+        for folder in folders {
+            let capture = Capture::load(folder, &self.reading().with_memory(0))?;
+            capture.check_trainable()?;
+            if capture.split.test.is_empty() {
+                return Err(Failure::BadInput(format!(
+                    "{}: the capture holds out no view, so there is nothing to compare recipes on; let its split name one",
+                    folder.display()
+                )));
+            }
+            let name = capture.name.clone();
+            // Files of both would be the same where case is ignored.
+            let same = |other: &&Subject| other.name.to_lowercase() == name.to_lowercase();
+            if let Some(other) = self.captures.iter().find(same) {
+                return Err(Failure::BadInput(format!(
+                    "{} and {}: both captures are called {name}, and results go by that name; give each an --out of its own",
+                    other.folder.display(),
+                    folder.display()
+                )));
+            }
+            let photos = capture.photo_files();
+            let picture = pictures::of_capture(out, &name);
+            refuse_inputs([picture], photos.iter().map(PathBuf::as_path))?;
+            self.captures.push(Subject {
+                name,
+                folder: folder.clone(),
+            });
+        }
+        Ok(())
+    }
+
+    /// How captures are read.
+    fn reading(&self) -> CaptureSettings {
+        CaptureSettings::new().with_downscale(self.downscale)
+    }
+
+    /// Reads the capture of a run, with its photos.
+    pub(super) fn load(&self, run: &Run, global: &GlobalArgs) -> Result<Capture, Failure> {
+        let folder = &self.captures[run.capture].folder;
+        Ok(photos::load(folder, &self.reading(), global)?)
+    }
+
+    /// All runs, in turns: with each seed, each recipe once on each capture.
+    pub(super) fn runs(&self) -> Vec<Run> {
+        let mut runs = Vec::new();
+        for seed in 0..self.seeds {
+            for (capture, subject) in self.captures.iter().enumerate() {
+                for recipe in &self.recipes {
+                    let settings = settings(recipe, self.steps, self.downscale, seed);
+                    runs.push(Run {
+                        capture,
+                        recipe: *recipe,
+                        key: Key {
+                            capture: subject.name.clone(),
+                            recipe: recipe.name.to_owned(),
+                            seed,
+                            steps: settings.steps,
+                            downscale: self.downscale,
+                            device: self.device.clone(),
+                        },
+                    });
+                }
+            }
+        }
+        runs
+    }
+
+    /// The runs without a row.
+    pub(super) fn missing(&self, rows: &[Row]) -> Vec<Run> {
+        let runs = self.runs().into_iter();
+        runs.filter(|run| run.row(rows).is_none()).collect()
+    }
+
+    /// The rows of the plan's runs: by capture, then by recipe, then by seed.
+    pub(super) fn measured<'a>(&self, rows: &'a [Row]) -> Vec<&'a Row> {
+        let mut runs = self.runs();
+        let place = |recipe: &Recipe| self.recipes.iter().position(|known| known == recipe);
+        runs.sort_by_key(|run| (run.capture, place(&run.recipe), run.key.seed));
+        runs.iter().filter_map(|run| run.row(rows)).collect()
+    }
+}
+
+impl Run {
+    /// The settings of the run.
+    pub(super) fn settings(&self) -> TrainSettings {
+        let Key {
+            seed,
+            steps,
+            downscale,
+            ..
+        } = self.key;
+        settings(&self.recipe, Some(steps), downscale, seed)
+    }
+
+    /// Digest of the recipe's TOML.
+    pub(super) fn digest(&self) -> String {
+        digest(self.recipe.toml)
+    }
+
+    /// The row of the run, unless the recipe was another one then.
+    fn row<'a>(&self, rows: &'a [Row]) -> Option<&'a Row> {
+        let own = |row: &&Row| row.key == self.key && row.digest == self.digest();
+        rows.iter().find(own)
+    }
+}
+
+impl std::fmt::Display for Run {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Key {
+            capture,
+            recipe,
+            seed,
+            ..
+        } = &self.key;
+        write!(f, "{capture}, {recipe}, seed {seed}")
+    }
+}
+
+/// The settings of a recipe for a run.
+fn settings(recipe: &Recipe, steps: Option<usize>, downscale: u32, seed: u64) -> TrainSettings {
+    let own = recipe.settings();
+    TrainSettings {
+        steps: steps.unwrap_or(own.steps),
+        seed,
+        downscale,
+        ..own
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::row::example;
+    use super::*;
+
+    /// Two captures, two recipes and two seeds.
+    fn plan() -> Plan {
+        let recipes = ["default", "mcmc"].map(|name| Recipe::of_name(name).unwrap());
+        let subject = |name: &str| Subject {
+            name: name.to_owned(),
+            folder: name.into(),
+        };
+        Plan {
+            captures: ["a", "b"].map(subject).into(),
+            device: "cpu".to_owned(),
+            ..Plan::new(recipes.into(), 2, Some(100), 4).unwrap()
+        }
+    }
+
+    /// A row of the plan's run.
+    fn row(capture: &str, recipe: &str, seed: u64) -> Row {
+        Row {
+            digest: digest(Recipe::of_name(recipe).unwrap().toml),
+            ..example(capture, recipe, seed, 20.0)
+        }
+    }
+
+    fn names(runs: &[Run]) -> Vec<String> {
+        runs.iter().map(Run::to_string).collect()
+    }
+
+    #[test]
+    fn runs_take_turns() {
+        assert_eq!(
+            names(&plan().runs()),
+            [
+                "a, default, seed 0",
+                "a, mcmc, seed 0",
+                "b, default, seed 0",
+                "b, mcmc, seed 0",
+                "a, default, seed 1",
+                "a, mcmc, seed 1",
+                "b, default, seed 1",
+                "b, mcmc, seed 1",
+            ]
+        );
+        let settings = plan().runs()[5].settings();
+        assert_eq!(
+            (settings.steps, settings.downscale, settings.seed),
+            (100, 4, 1)
+        );
+    }
+
+    #[test]
+    fn what_was_measured_is_not_missing() {
+        let mut plan = plan();
+        let mut rows = vec![
+            row("b", "mcmc", 1),
+            row("a", "mcmc", 1),
+            row("a", "mcmc", 0),
+            row("a", "default", 1),
+            row("a", "default", 0),
+            row("c", "default", 0),
+        ];
+        let missing = [
+            "b, default, seed 0",
+            "b, mcmc, seed 0",
+            "b, default, seed 1",
+        ];
+        assert_eq!(names(&plan.missing(&rows)), missing);
+        let measured = plan.measured(&rows).into_iter();
+        let measured: Vec<_> = measured
+            .map(|row| (&*row.key.capture, &*row.key.recipe, row.key.seed))
+            .collect();
+        assert_eq!(
+            measured,
+            [
+                ("a", "default", 0),
+                ("a", "default", 1),
+                ("a", "mcmc", 0),
+                ("a", "mcmc", 1),
+                ("b", "mcmc", 1),
+            ]
+        );
+
+        // Another recipe of that name, number of steps, size or device is another run.
+        let changes: [fn(&mut Row); 4] = [
+            |row| row.digest = "other".to_owned(),
+            |row| row.key.steps += 1,
+            |row| row.key.downscale += 1,
+            |row| row.key.device = "wgpu".to_owned(),
+        ];
+        for (row, change) in rows.iter_mut().zip(changes) {
+            change(row);
+        }
+        assert_eq!(plan.missing(&rows).len(), 7);
+        plan.seeds = 3;
+        assert_eq!(plan.missing(&rows).len(), 11);
+    }
+
+    #[test]
+    fn unusable_settings_are_refused() {
+        let recipe = Recipe::of_name("default").unwrap();
+        let refused = Plan::new(vec![recipe], 1, Some(0), 1).err().unwrap();
+        let words = refused.to_string();
+        assert!(
+            words.contains("default") && words.contains("`steps`"),
+            "{words}"
+        );
+    }
+}
