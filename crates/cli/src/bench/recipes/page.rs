@@ -171,7 +171,7 @@ mod tests {
             }],
             ..Plan::new(recipes.into(), 2, Some(100), 4).unwrap()
         };
-        let mut rows = vec![
+        let mut rows = [
             example("a|b", BASE, 0, 20.0),
             example("a|b", BASE, 1, 22.0),
             example("a|b", "mcmc", 0, 20.5),

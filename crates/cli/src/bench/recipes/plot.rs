@@ -133,7 +133,7 @@ mod tests {
 
     #[test]
     fn every_capture_and_recipe_is_drawn() {
-        let mut rows = vec![
+        let mut rows = [
             example("garden", "default", 0, 20.0),
             example("garden", "default", 1, 20.5),
             example("garden", "mcmc", 0, 21.0),
