@@ -264,6 +264,12 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     let trainer = trainer.autosave(Duration::from_secs(args.autosave), move |checkpoint| {
         checkpoint.save(&file)
     });
+    if config.calibration.poses && config.calibration.bundle_adjustment {
+        global.say(match capture.observations.is_empty() {
+            true => "looking for keypoints that photos share, to adjust the poses to them",
+            false => "adjusting the poses to the keypoints",
+        });
+    }
     let trainer = shown(trainer, &progress).build()?;
     if let Some(adjusted) = trainer.bundle_adjustment().filter(|_| fresh) {
         global.say(format_args!(

@@ -62,7 +62,7 @@ pub(super) fn assemble(
         });
     }
     Ok(SparseModel {
-        observations: observations(images_file, &by_id, &images, &points)?,
+        observations: observations([images_file, points_file], &by_id, &images, &points)?,
         cameras: by_id.into_iter().map(|(id, c)| (id, sparse(c))).collect(),
         images: images.into_iter().map(image).collect(),
         points: points.into_iter().map(|point| point.point).collect(),
@@ -73,7 +73,7 @@ pub(super) fn assemble(
 /// The keypoints of the images, sorted by image. Those of points that the model does not have, as
 /// after points were removed, are left out.
 fn observations(
-    images_file: &Path,
+    [images_file, points_file]: [&Path; 2],
     cameras: &HashMap<u32, ColmapCamera>,
     images: &[ColmapImage],
     points: &[ColmapPoint],
@@ -83,6 +83,16 @@ fn observations(
     }
     let index = |(index, point): (usize, &ColmapPoint)| (point.id, index as u32);
     let by_id: HashMap<u64, u32> = points.iter().enumerate().map(index).collect();
+    if by_id.len() < points.len() {
+        let twice = (points.iter().enumerate())
+            .find(|(at, point)| by_id.get(&point.id).is_none_or(|last| *last != *at as u32));
+        let id = twice.map_or(0, |(_, point)| point.id);
+        return Err(CaptureError::BadRecord {
+            path: points_file.to_path_buf(),
+            record: format!("point {id}"),
+            reason: "its id occurs twice, and keypoints refer to it".to_owned(),
+        });
+    }
     let mut observations = Vec::new();
     for (view, image) in images.iter().enumerate() {
         let [fx, fy, cx, cy] = cameras[&image.camera_id].intrinsics;

@@ -169,7 +169,15 @@ fn matched_keypoints(mut fields: Fields<'_>) -> Result<Vec<ColmapKeypoint>, Capt
         // Some programs write ids as they write positions.
         let whole: f64 = fields.next("keypoints")?;
         let point_id = id.parse().ok();
-        let point_id = point_id.or_else(|| (whole >= 0.0).then_some(whole as u64));
+        if point_id.is_none() && whole.fract() != 0.0 {
+            return Err(fields.error(&format!(
+                "the point id `{}` of a keypoint is not whole",
+                Excerpt(id)
+            )));
+        }
+        // The largest number below which no two ids are the same as numbers with a fraction.
+        let exact = 0.0..9e15;
+        let point_id = point_id.or_else(|| exact.contains(&whole).then_some(whole as u64));
         keypoints.extend(point_id.map(|point_id| ColmapKeypoint { position, point_id }));
     }
     Ok(keypoints)

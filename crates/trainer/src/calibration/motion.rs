@@ -62,7 +62,7 @@ pub(super) fn moved_f64(viewmat: DMat4, motion: [f64; MOTION], length: f64) -> D
 pub(super) fn motion_between(before: DMat4, after: DMat4, length: f64) -> [f64; MOTION] {
     let rigid = after * before.inverse();
     let turn = DMat3::from_mat4(rigid);
-    // Half the tangent of half the angle along the axis, twice.
+    // Twice the tangent of half the angle, along the axis.
     let quaternion = DQuat::from_mat3(&turn);
     let rotation = quaternion.xyz() * (2.0 / quaternion.w);
     let shift = rigid.w_axis.truncate() / length - (DVec3::Z - turn.z_axis);

@@ -2,6 +2,7 @@
 
 use burn::module::{Module, Param};
 use burn::tensor::{Device, Gradients, Tensor, TensorData};
+use burn_pack::Scalar;
 use splat_model::optimizer::{SplatAdam, StateRecord};
 use splat_model::strategy::StepInfo;
 use splat_model::{Camera, CameraTensors, FieldStep, Optimized, SceneScale};
@@ -10,6 +11,9 @@ use splat_ops::OpError;
 use super::motion::{MOTION, motion_between, moved, moved_f64};
 use super::{BundleAdjustment, CalibrationSchedule, CalibrationSettings};
 use crate::{Hook, HookView};
+
+/// Name of the rate in a checkpoint.
+const RATE: &str = "pose_rate";
 
 #[derive(Module, Debug)]
 struct Motions {
@@ -55,7 +59,8 @@ impl RefinePoses {
         })
     }
 
-    /// These poses, which begin as the adjusted ones and go on at their rate.
+    /// These poses, which begin as the adjusted ones, and go on at their rate if all were adjusted
+    /// and the lens stays as it is.
     ///
     /// # Errors
     /// When the device fails.
@@ -72,7 +77,10 @@ impl RefinePoses {
             .collect();
         let data = TensorData::new(motions, [cameras.len(), MOTION]);
         (self.motions).update("motions", |old| Tensor::from_data(data, &old.device()))?;
-        self.rate = settings.adjusted_pose_rate;
+        // Views that were not adjusted have their way still to go, and so have all with a new lens.
+        if adjusted.views == cameras.len() && !settings.intrinsics {
+            self.rate = settings.adjusted_pose_rate;
+        }
         Ok(self)
     }
 
@@ -119,10 +127,19 @@ impl Hook for RefinePoses {
     }
 
     fn save(&self) -> Result<StateRecord, OpError> {
-        self.motions.save()
+        let mut record = self.motions.save()?;
+        let rate = Scalar::Float(self.rate);
+        record.scalars.insert(RATE.to_owned(), rate);
+        Ok(record)
     }
 
-    fn restore(&mut self, record: StateRecord, device: &Device) -> Result<(), String> {
+    fn restore(&mut self, mut record: StateRecord, device: &Device) -> Result<(), String> {
+        match record.scalars.remove(RATE) {
+            Some(Scalar::Float(rate)) if (0.0..=1.0).contains(&rate) => self.rate = rate,
+            // From before there were adjusted poses.
+            None => {}
+            Some(other) => return Err(format!("`{RATE}` is {other:?}, which is no rate")),
+        }
         self.motions.restore(record, device)
     }
 }

@@ -17,8 +17,8 @@ pub struct CalibrationSettings {
     /// Refine focal lengths, principal points and distortion, one set for all views that begin with
     /// the same. Default false.
     pub intrinsics: bool,
-    /// Adjust the poses to the keypoints of the capture before training, where it has them, see
-    /// [`adjust_bundle`](super::adjust_bundle). Default true.
+    /// Adjust the poses to keypoints before training, those of the capture or else corners that
+    /// photos share, see [`adjust_bundle`](super::adjust_bundle). Default true.
     pub bundle_adjustment: bool,
     /// Rate of poses that were not adjusted: radians for rotations, sizes of the scene for
     /// translations. Default 1e-3.

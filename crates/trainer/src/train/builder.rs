@@ -209,7 +209,11 @@ impl<M: SplatModel> TrainerBuilder<M> {
             true => Some(Spectrum::of(&self.capture)?),
             false => None,
         };
-        let adjusted = adjusted(&self.capture, &self.config, &mut self.watch)?;
+        let adjusted = match self.resume {
+            // Its poses are in the checkpoint.
+            Some(_) => None,
+            None => adjusted(&self.capture, &self.config, &mut self.watch)?,
+        };
         let calibrating = calibration(
             &self.capture,
             &self.config,
@@ -328,6 +332,7 @@ fn adjusted(
         return Ok(None);
     }
     let Some(adjusted) = adjust_bundle(capture)? else {
+        (watch.on_warning)(&Warning::TooFewKeypoints);
         return Ok(None);
     };
     if !adjusted.fits {

@@ -73,8 +73,8 @@ pub struct TrainSettings {
     /// Which Gaussians there are, where the trainer is given no strategy of its own. Default
     /// `adc`.
     pub strategy: StrategyKind,
-    /// Share of the limit that growth has where the strategy's `max_gaussians` is absent. Infinity
-    /// is no limit. Default 1.
+    /// Share of the default limit of growth, where the strategy's `max_gaussians` is absent;
+    /// without effect where it is given. Infinity is no limit. Default 1.
     pub max_gaussians_share: f64,
     /// The first Gaussians.
     pub init: InitSettings,
@@ -267,6 +267,16 @@ impl TrainSettings {
             return Err(format!(
                 "`max_gaussians_share` must be above 0, it is {share}"
             ));
+        }
+        if self.strategy == StrategyKind::Improved
+            && self.improved.selection.final_share.is_some()
+            && self.improved.max_gaussians.is_none()
+            && self.max_gaussians_share.is_infinite()
+        {
+            return Err(
+                "`improved.selection.final_share` is a share of the limit of growth, and there is none: give `improved.max_gaussians` or a finite `max_gaussians_share`"
+                    .to_owned(),
+            );
         }
         (self.mcmc.validate()).map_err(|problem| problem.replacen('`', "`mcmc.", 1))?;
         (self.improved.validate()).map_err(|problem| problem.replacen('`', "`improved.", 1))?;
@@ -510,6 +520,15 @@ mod tests {
         assert!(found.contains("`spectral_resolution`"), "{found}");
         let found = problem(&|config| config.max_gaussians_share = f64::NAN);
         assert!(found.contains("`max_gaussians_share`"), "{found}");
+        let found = problem(&|config| {
+            config.strategy = StrategyKind::Improved;
+            config.max_gaussians_share = f64::INFINITY;
+            config.improved.selection.final_share = Some(0.3);
+        });
+        assert!(
+            found.contains("`improved.selection.final_share`"),
+            "{found}"
+        );
         let found = problem(&|config| config.mcmc.growth = 0.5);
         assert!(found.contains("`mcmc.growth`"), "{found}");
         let found = problem(&|config| config.improved.reset_opacity = 0.003);

@@ -82,6 +82,8 @@ pub enum Warning {
         /// Their names.
         views: Vec<String>,
     },
+    /// No training views have enough keypoints in common to adjust their poses to.
+    TooFewKeypoints,
     /// The keypoints disagree with the photos and cameras.
     KeypointsDoNotFit {
         /// True if they were looked for in the photos, false if they are the capture's.
@@ -233,9 +235,17 @@ impl fmt::Display for Warning {
                 "{}: the photo has other pixels than the one that the run was begun with; it goes on with those there are now",
                 Names(views)
             ),
-            Self::KeypointsDoNotFit { matched: true, .. } => write!(
+            Self::TooFewKeypoints => write!(
                 f,
-                "the photos have too few corners in common for a bundle adjustment; poses are refined by gradients of the photos alone"
+                "the photos have too few keypoints in common to adjust poses to; poses are refined by gradients of the photos alone"
+            ),
+            Self::KeypointsDoNotFit {
+                matched: true,
+                after,
+                ..
+            } => write!(
+                f,
+                "corners that the photos seem to share do not agree ({after:.2} pixels off in the median, and more when they are matched anew); poses are refined by gradients of the photos alone"
             ),
             Self::KeypointsDoNotFit { before, after, .. } => write!(
                 f,

@@ -35,6 +35,9 @@ pub(super) struct Run {
     pub capture: usize,
     pub recipe: Recipe,
     pub key: Key,
+    /// Digest of the program's version, the folder of the capture and all settings: a result is of
+    /// this run only if it has the same.
+    digest: String,
 }
 
 impl Plan {
@@ -112,7 +115,11 @@ impl Plan {
             for (capture, subject) in self.captures.iter().enumerate() {
                 for recipe in &self.recipes {
                     let settings = settings(recipe, self.steps, self.downscale, seed);
+                    let folder = subject.folder.canonicalize();
+                    let folder = folder.unwrap_or_else(|_| subject.folder.clone());
+                    let version = env!("CARGO_PKG_VERSION");
                     runs.push(Run {
+                        digest: digest(&format!("{version} {} {settings:?}", folder.display())),
                         capture,
                         recipe: *recipe,
                         key: Key {
@@ -157,9 +164,9 @@ impl Run {
         settings(&self.recipe, Some(steps), downscale, seed)
     }
 
-    /// Digest of the recipe's TOML.
+    /// What tells its results from those of other runs with the same names.
     pub(super) fn digest(&self) -> String {
-        digest(self.recipe.toml)
+        self.digest.clone()
     }
 
     /// The row of the run, unless the recipe was another one then.
@@ -213,9 +220,11 @@ mod tests {
 
     /// A row of the plan's run.
     fn row(capture: &str, recipe: &str, seed: u64) -> Row {
+        let row = example(capture, recipe, seed, 20.0);
+        let run = plan().runs().into_iter().find(|run| run.key == row.key);
         Row {
-            digest: digest(Recipe::of_name(recipe).unwrap().toml),
-            ..example(capture, recipe, seed, 20.0)
+            digest: run.map_or_else(String::new, |run| run.digest()),
+            ..row
         }
     }
 

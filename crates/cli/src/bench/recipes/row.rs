@@ -22,7 +22,7 @@ pub(super) struct Key {
 pub(super) struct Row {
     /// The run.
     pub key: Key,
-    /// [`digest`] of the recipe's TOML.
+    /// [`digest`] of the run's settings, capture and program.
     pub digest: String,
     /// Held-out PSNR in dB.
     pub psnr: f64,

@@ -140,6 +140,14 @@ impl ImprovedGsSettings {
                 "`reset_opacity` {reset} must be above `prune_opacity` {prune}, or every reset removes the scene"
             ));
         }
+        let selection = &self.selection;
+        let selects = selection.final_gaussians.is_some() || selection.final_share.is_some();
+        if selects && selection.stop <= self.stop {
+            return Err(format!(
+                "`selection.stop` {} must come after `stop` {}, where growth ends and selection begins",
+                selection.stop, self.stop
+            ));
+        }
         (self.selection.validate(self.max_gaussians))
             .map_err(|problem| problem.replacen('`', "`selection.", 1))
     }

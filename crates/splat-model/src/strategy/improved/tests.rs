@@ -170,6 +170,10 @@ fn settings_out_of_range_are_named() {
             selection(&|settings| settings.final_gaussians = Some(300)),
         ),
         (
+            "selection.stop",
+            selection(&|settings| settings.stop = 15_000),
+        ),
+        (
             "selection.overgrowth",
             selection(&|settings| settings.overgrowth = 0.9),
         ),

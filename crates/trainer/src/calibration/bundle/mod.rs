@@ -29,6 +29,11 @@ const CONVERGED: f64 = 1e-7;
 /// Keypoints with a larger error in the median, as a share of the photo's longer side, are not
 /// those of these photos and cameras.
 const LARGEST_ERROR: f64 = 0.003;
+/// Poses that are wrong by so much, as a share of the photo's longer side, are not those of the
+/// keypoints: these may be of photos of another size.
+const LARGEST_ERROR_BEFORE: f64 = 0.05;
+/// Smaller errors, as a share of the photo's longer side, are none.
+const NO_ERROR: f64 = 1e-4;
 /// Huber's loss is quadratic up to this many times the median error.
 const QUADRATIC: f64 = 3.0;
 /// Corners are looked for this far from where they should be, as shares of the longer side: first
@@ -46,6 +51,8 @@ pub struct BundleAdjustment {
     /// Positions of the capture's points. Those that fewer than two training views observe are
     /// unchanged, and so are all if the keypoints were [`matched`](Self::matched).
     pub points: Vec<[f64; 3]>,
+    /// Number of training views whose poses were adjusted.
+    pub views: usize,
     /// Keypoints that were used.
     pub keypoints: usize,
     /// True if the capture has no keypoints of its own, and corners of its photos were taken.
@@ -55,9 +62,10 @@ pub struct BundleAdjustment {
     /// The same after.
     pub error_after: f64,
     /// True if the keypoints agree: the error after is no larger than before, and at most 0.3 % of
-    /// the photo's longer side. Matched ones must also be found anew where the adjusted poses have
-    /// them, within the same bound. If false, they are those of other photos, of a lens that is not
-    /// the capture's, or wrong matches, and poses and points should not be taken over.
+    /// the photo's longer side, that before at most 5 %. Matched ones must also be found anew where
+    /// the adjusted poses have them, within the same bound. If false, they are those of other
+    /// photos, of a lens that is not the capture's, or wrong matches, and poses and points should
+    /// not be taken over.
     pub fits: bool,
 }
 
@@ -137,7 +145,7 @@ fn of_corners(views: &[&View], start: Unknowns) -> Result<Option<BundleAdjustmen
         let next = result(&problem, &unknowns, before, views);
         adjusted = Some(BundleAdjustment {
             // Wrong matches agree with the poses that follow from them, but new ones do not.
-            fits: next.fits && before <= bound(views),
+            fits: next.fits && before <= LARGEST_ERROR * longer(views),
             error_before: adjusted.map_or(before, |first| first.error_before),
             ..next
         });
@@ -157,19 +165,22 @@ fn result(
     BundleAdjustment {
         viewmats: unknowns.viewmats.clone(),
         points: vec![],
+        views: problem.observing_views(),
         keypoints: problem.sights.len(),
         matched: false,
         error_before,
         error_after,
         // Not so with NaN.
-        fits: error_after <= error_before && error_after <= bound(views),
+        fits: error_after <= error_before.max(NO_ERROR * longer(views))
+            && error_before <= LARGEST_ERROR_BEFORE * longer(views)
+            && error_after <= LARGEST_ERROR * longer(views),
     }
 }
 
-/// The largest median error of keypoints that fit, in pixels.
-fn bound(views: &[&View]) -> f64 {
+/// The longest side of all photos, in pixels.
+fn longer(views: &[&View]) -> f64 {
     let longer = views.iter().map(|view| view.width.max(view.height)).max();
-    LARGEST_ERROR * f64::from(longer.unwrap_or(0))
+    f64::from(longer.unwrap_or(0))
 }
 
 impl BundleAdjustment {

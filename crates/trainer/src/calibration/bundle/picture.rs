@@ -9,7 +9,8 @@ const PATCH: usize = (2 * HALF as usize + 1).pow(2);
 /// A patch whose grey varies by less has nothing to find: standard deviation, from 0 to 1.
 const LEAST_CONTRAST: f32 = 0.02;
 
-/// A picture in grey, from 0 to 1. The centre of its first pixel is at (0.5, 0.5).
+/// A picture in grey, from 0 to 1, or NaN where a mask hides it. The centre of its first pixel is
+/// at (0.5, 0.5).
 pub(super) struct Picture {
     width: usize,
     height: usize,
@@ -37,10 +38,16 @@ pub(super) struct Found {
 impl Picture {
     pub fn of(view: &View) -> Self {
         let grey = |pixel: &[u8]| pixel.iter().map(|x| f32::from(*x)).sum::<f32>() / (3.0 * 255.0);
+        let mut grey: Vec<f32> = view.image.chunks_exact(3).map(grey).collect();
+        for (grey, mask) in grey.iter_mut().zip(view.mask.iter().flat_map(|m| m.iter())) {
+            if *mask < u8::MAX {
+                *grey = f32::NAN;
+            }
+        }
         Self {
             width: view.width as usize,
             height: view.height as usize,
-            grey: view.image.chunks_exact(3).map(grey).collect(),
+            grey,
         }
     }
 
@@ -62,7 +69,8 @@ impl Picture {
         Some(row(j) * (1.0 - v) + row(j + 1) * v)
     }
 
-    /// The patch around a position. `None` if it reaches beyond the picture or is of one grey.
+    /// The patch around a position. `None` if it reaches beyond the picture or under a mask, or is
+    /// of one grey.
     pub fn patch(&self, [x, y]: [f64; 2], warp: Warp) -> Option<Patch> {
         let mut values = [0.0; PATCH];
         let mut at = 0;
@@ -77,7 +85,8 @@ impl Picture {
         let mean = values.iter().sum::<f32>() / PATCH as f32;
         values.iter_mut().for_each(|value| *value -= mean);
         let length = values.iter().map(|value| value * value).sum::<f32>().sqrt();
-        if length < LEAST_CONTRAST * (PATCH as f32).sqrt() {
+        // NaN neither.
+        if !(length >= LEAST_CONTRAST * (PATCH as f32).sqrt()) {
             return None;
         }
         values.iter_mut().for_each(|value| *value /= length);
@@ -152,7 +161,8 @@ impl Picture {
                     ),
                     false => (0.0, 0.0),
                 };
-                let (dx, dy) = (f64::from(dx), f64::from(dy));
+                let seen = |d: f32| f64::from(if d.is_finite() { d } else { 0.0 });
+                let (dx, dy) = (seen(dx), seen(dy));
                 let own = [dx * dx, dx * dy, dy * dy];
                 let [left, above, both] =
                     [(x, y + 1), (x + 1, y), (x, y)].map(|(x, y)| sums[y * (w + 1) + x]);
@@ -254,6 +264,9 @@ mod tests {
         assert!(flat.corners(8).is_empty());
         assert!(flat.patch([20.0, 20.0], UPRIGHT).is_none());
         assert!(picture([0.0; 2]).patch([2.0, 20.0], UPRIGHT).is_none());
+        let mut hidden = picture([0.0; 2]);
+        hidden.grey.fill(f32::NAN);
+        assert!(hidden.corners(8).is_empty());
         let tiny = Picture {
             width: 3,
             height: 2,

@@ -190,6 +190,15 @@ impl<'a> Problem<'a> {
         })
     }
 
+    /// Number of views that have keypoints.
+    pub fn observing_views(&self) -> usize {
+        let mut observes = vec![false; self.views];
+        for sight in &self.sights {
+            observes[sight.view] = true;
+        }
+        observes.iter().filter(|observes| **observes).count()
+    }
+
     /// The same without keypoints whose error is many times that of the others.
     pub fn without_outliers(&self, unknowns: &Unknowns, times: f64) -> Option<Self> {
         let errors = self.errors(unknowns);

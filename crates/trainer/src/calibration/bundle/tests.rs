@@ -163,6 +163,16 @@ fn keypoints_of_other_photos_do_not_fit() {
     assert!(!adjust(&capture).fits);
 }
 
+/// As of photos that were resampled since: a scene can be bent to agree with them.
+#[test]
+fn keypoints_of_photos_of_another_size_do_not_fit() {
+    let mut capture = capture(Lens::Pinhole);
+    for observation in &mut capture.observations {
+        observation.position = observation.position.map(|x| 0.5 * x - 0.15);
+    }
+    assert!(!adjust(&capture).fits);
+}
+
 #[test]
 fn views_without_enough_keypoints_stay_where_they_are() {
     let mut capture = perturbed(&capture(Lens::Pinhole));
@@ -175,7 +185,7 @@ fn views_without_enough_keypoints_stay_where_they_are() {
     let adjusted = adjust(&capture);
     assert_eq!(adjusted.viewmats[2], viewmat(&capture.views[2]));
     assert_ne!(adjusted.viewmats[1], viewmat(&capture.views[1]));
-    assert_eq!(adjusted.keypoints, 5 * 120);
+    assert_eq!((adjusted.views, adjusted.keypoints), (5, 5 * 120));
 
     capture
         .observations
