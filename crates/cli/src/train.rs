@@ -273,7 +273,9 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     let trainer = shown(trainer, &progress).build()?;
     if let Some(adjusted) = trainer.bundle_adjustment().filter(|_| fresh) {
         global.say(format_args!(
-            "poses adjusted to {} keypoints{}: {:.2} pixels off in the median, {:.2} before",
+            "{} of {} poses adjusted to {} keypoints{}: {:.2} pixels off in the median, {:.2} before",
+            adjusted.views,
+            adjusted.viewmats.len(),
             adjusted.keypoints,
             if adjusted.matched {
                 " found in the photos"
