@@ -5,6 +5,7 @@ pub mod compact;
 mod evaluate;
 mod hooks;
 mod photo;
+mod quantile;
 mod train;
 
 pub use calibration::CalibrationSettings;

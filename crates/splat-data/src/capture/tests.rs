@@ -112,6 +112,37 @@ fn keypoints_are_read_if_asked_for() {
 }
 
 #[test]
+fn ids_that_say_nothing_are_named() {
+    let settings = CaptureSettings::new().with_observations(true);
+    let problem = |root: &Path| {
+        assert!(load(root).is_ok());
+        let error = Capture::load(root, &settings).unwrap_err();
+        error.to_string()
+    };
+    let (root, mut model) = good();
+    model.points[1].0 = model.points[4].0;
+    model.write_binary(&root.path().join("sparse/0"));
+    let message = problem(root.path());
+    let id = model.points[4].0.to_string();
+    assert!(
+        message.contains("points3D.bin") && message.contains(&id),
+        "{message}"
+    );
+
+    let (root, model) = good();
+    std::fs::remove_dir_all(root.path().join("sparse")).unwrap();
+    let folder = root.path().join("sparse");
+    model.write_text(&folder);
+    let images = std::fs::read_to_string(folder.join("images.txt")).unwrap();
+    std::fs::write(folder.join("images.txt"), images.replace("12.0", "12.5")).unwrap();
+    let message = problem(root.path());
+    assert!(
+        message.contains("line 3") && message.contains("`12.5`"),
+        "{message}"
+    );
+}
+
+#[test]
 fn a_keypoint_at_infinity_is_named() {
     let (root, model) = good();
     let mut images = model.images_bin();

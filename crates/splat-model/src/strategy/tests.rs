@@ -222,19 +222,22 @@ fn adc_agrees(name: &str) {
         let splats = Splats::read(&model).unwrap();
         let strategy = Adc::new(settings.clone());
         let (edit, _) = strategy.plan_with(&at, &splats, &means, draw);
-        let ours = kinds(&edit);
-        assert_eq!(ours.len(), theirs.len(), "{name}: rows after");
-        let order: Vec<usize> = ours
-            .iter()
-            .map(|row| theirs.iter().position(|other| other == row))
-            .map(|place| place.unwrap_or_else(|| panic!("{name}: {ours:?} is not {theirs:?}")))
-            .collect();
+        let order = order_of(name, &kinds(&edit), &theirs);
         model.edit_rows(&edit).unwrap();
         if file.flag("reset") {
             model.clamp_opacities(settings.reset_opacity).unwrap();
         }
         compare(&file, &setup, &mut model, &order);
     }
+}
+
+/// The place of each of our rows after a refinement among those of a file.
+fn order_of(name: &str, ours: &[(usize, i32)], theirs: &[(usize, i32)]) -> Vec<usize> {
+    assert_eq!(ours.len(), theirs.len(), "{name}: rows after");
+    ours.iter()
+        .map(|row| theirs.iter().position(|other| other == row))
+        .map(|place| place.unwrap_or_else(|| panic!("{name}: {ours:?} is not {theirs:?}")))
+        .collect()
 }
 
 #[test]

@@ -306,21 +306,6 @@ impl fmt::Display for Names<'_> {
     }
 }
 
-/// The middle value, the upper of two; NaN if empty.
-fn median(values: impl IntoIterator<Item = f64>) -> f64 {
-    quantile(values, 0.5)
-}
-
-/// The value at a quantile; NaN if empty.
-fn quantile(values: impl IntoIterator<Item = f64>, share: f64) -> f64 {
-    let mut values: Vec<f64> = values.into_iter().collect();
-    if values.is_empty() {
-        return f64::NAN;
-    }
-    let index = ((values.len() as f64 * share) as usize).min(values.len() - 1);
-    *values.select_nth_unstable_by(index, f64::total_cmp).1
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -383,13 +368,5 @@ mod tests {
         let points = |count| Warning::CoincidentPoints { count, points: 9 };
         assert_eq!(points(8).beyond(&known), Some(points(8)));
         assert_eq!(points(8).beyond(&[points(7)]), None);
-    }
-
-    #[test]
-    fn quantiles_are_values_of_the_list() {
-        let values = [5.0, 1.0, 3.0, 2.0];
-        assert_eq!((median(values), quantile(values, 0.0)), (3.0, 1.0));
-        assert_eq!(quantile(values, 1.0), 5.0);
-        assert!(median([]).is_nan());
     }
 }

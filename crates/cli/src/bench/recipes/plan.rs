@@ -299,6 +299,10 @@ mod tests {
         assert_eq!(plan.missing(&rows).len(), 7);
         plan.seeds = 3;
         assert_eq!(plan.missing(&rows).len(), 11);
+        // A capture of the same name in another folder.
+        plan.captures[0].folder = "elsewhere".into();
+        plan.captures[1].folder = "elsewhere".into();
+        assert_eq!(plan.missing(&rows).len(), 12);
     }
 
     #[test]

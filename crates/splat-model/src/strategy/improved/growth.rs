@@ -92,16 +92,8 @@ impl ImprovedGsSettings {
 
 #[cfg(test)]
 mod tests {
+    use super::super::tests::at;
     use super::*;
-
-    fn at(steps: usize, step: usize) -> StepInfo {
-        let run = RunSchedule {
-            steps,
-            scene_scale: splat_data::SceneScale::new(1.0).unwrap(),
-            seed: 1,
-        };
-        StepInfo { step, run }
-    }
 
     fn growth(steps: usize) -> Growth {
         let settings = ImprovedGsSettings::new().with_max_gaussians(1_000_000);

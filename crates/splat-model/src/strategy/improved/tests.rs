@@ -5,7 +5,7 @@ use crate::Gaussians;
 use crate::opacity::logit;
 use crate::strategy::RunSchedule;
 
-fn at(steps: usize, step: usize) -> StepInfo {
+pub(super) fn at(steps: usize, step: usize) -> StepInfo {
     let run = RunSchedule {
         steps,
         scene_scale: splat_data::SceneScale::new(1.0).unwrap(),

@@ -38,13 +38,7 @@ fn improved_agrees(name: &str) {
         let mut model = before(&file, &setup);
         let splats = Splats::read(&model).unwrap();
         let edit = planned(&file, &splats, |_| ());
-        let ours = kinds(&edit);
-        assert_eq!(ours.len(), theirs.len(), "{name}: rows after");
-        let order: Vec<usize> = ours
-            .iter()
-            .map(|row| theirs.iter().position(|other| other == row))
-            .map(|place| place.unwrap_or_else(|| panic!("{name}: {ours:?} is not {theirs:?}")))
-            .collect();
+        let order = order_of(name, &kinds(&edit), &theirs);
         model.edit_rows(&edit).unwrap();
         compare(&file, &setup, &mut model, &order);
     }

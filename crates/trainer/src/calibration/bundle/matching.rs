@@ -10,7 +10,7 @@ use splat_data::{BoundedLens, Camera, CaptureError, View};
 
 use super::picture::{Patch, Picture, UPRIGHT, Warp};
 use super::problem::Sight;
-use super::viewmat;
+use crate::quantile::median;
 
 /// Photos are searched at this length of their longer side, or up to twice it.
 const SIDE: u32 = 480;
@@ -60,7 +60,7 @@ impl Photos {
             let view = view.downscaled((view.width.max(view.height) / SIDE).max(1));
             Ok(Photo {
                 lens: view.lens.bounded(),
-                to_world: viewmat(&view).inverse(),
+                to_world: view.camera().viewmat.inverse(),
                 small: Picture::of(&view.downscaled(COARSE)),
                 whole: Picture::of(&view),
                 view: View {
@@ -263,12 +263,7 @@ impl Depths {
     /// which the correlation finds out.
     fn around(&self, [x, y]: [f64; 2]) -> Option<f64> {
         let square = y as usize / self.side * self.columns + x as usize / self.side;
-        let mut depths = self.squares.get(square)?.clone();
-        if depths.len() < Self::FEWEST {
-            return None;
-        }
-        let middle = depths.len() / 2;
-        let (_, median, _) = depths.select_nth_unstable_by(middle, f64::total_cmp);
-        Some(*median)
+        let depths = self.squares.get(square)?;
+        (depths.len() >= Self::FEWEST).then(|| median(depths.iter().copied()))
     }
 }

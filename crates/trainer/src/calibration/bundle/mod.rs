@@ -14,7 +14,7 @@ mod normal;
 mod picture;
 mod problem;
 
-use glam::{DMat4, DVec3, DVec4};
+use glam::{DMat4, DVec3};
 use splat_data::{Capture, CaptureError, View};
 
 use matching::Photos;
@@ -99,7 +99,7 @@ pub fn adjust_bundle(capture: &Capture) -> Result<Option<BundleAdjustment>, Capt
     let views: Vec<&View> = capture.train_views().collect();
     let points = capture.points.iter().map(|p| DVec3::from_array(p.position));
     let unknowns = Unknowns {
-        viewmats: views.iter().map(|view| viewmat(view)).collect(),
+        viewmats: views.iter().map(|view| view.camera().viewmat).collect(),
         points: points.collect(),
     };
     match capture.observations.is_empty() {
@@ -118,8 +118,10 @@ fn of_observations(
     for free_points in [false, true] {
         minimize(&problem, &mut unknowns, free_points);
     }
-    let points = unknowns.points.iter().map(DVec3::to_array).collect();
-    Some(result(&problem, &unknowns, before, views).with_points(points, false))
+    Some(BundleAdjustment {
+        points: unknowns.points.iter().map(DVec3::to_array).collect(),
+        ..result(&problem, &unknowns, before, views)
+    })
 }
 
 fn of_corners(views: &[&View], start: Unknowns) -> Result<Option<BundleAdjustment>, CaptureError> {
@@ -147,14 +149,16 @@ fn of_corners(views: &[&View], start: Unknowns) -> Result<Option<BundleAdjustmen
             // Wrong matches agree with the poses that follow from them, but new ones do not.
             fits: next.fits && before <= LARGEST_ERROR * longer(views),
             error_before: adjusted.map_or(before, |first| first.error_before),
+            points: start.points.iter().map(DVec3::to_array).collect(),
+            matched: true,
             ..next
         });
         viewmats = unknowns.viewmats;
     }
-    let points = start.points.iter().map(DVec3::to_array).collect();
-    Ok(adjusted.map(|adjusted| adjusted.with_points(points, true)))
+    Ok(adjusted)
 }
 
+/// The result of adjusting to keypoints of the capture, but for its points.
 fn result(
     problem: &Problem<'_>,
     unknowns: &Unknowns,
@@ -181,21 +185,6 @@ fn result(
 fn longer(views: &[&View]) -> f64 {
     let longer = views.iter().map(|view| view.width.max(view.height)).max();
     f64::from(longer.unwrap_or(0))
-}
-
-impl BundleAdjustment {
-    fn with_points(self, points: Vec<[f64; 3]>, matched: bool) -> Self {
-        Self {
-            points,
-            matched,
-            ..self
-        }
-    }
-}
-
-fn viewmat(view: &View) -> DMat4 {
-    let [x, y, z, w] = view.viewmat.map(DVec4::from_array);
-    DMat4::from_cols(x, y, z, w).transpose()
 }
 
 /// Levenberg's and Marquardt's method: Gauss and Newton's step, whose diagonal grows while steps

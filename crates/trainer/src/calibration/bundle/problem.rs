@@ -4,6 +4,7 @@ use glam::{DMat3, DMat4, DVec3};
 use splat_data::{BoundedLens, Capture, View};
 
 use super::FEWEST_KEYPOINTS;
+use crate::quantile::median;
 
 /// Differences of a projection are taken over this share of the distance to the camera.
 const DIFFERENCE: f64 = 1e-6;
@@ -79,10 +80,7 @@ pub(super) struct Errors(Vec<f64>);
 
 impl Errors {
     pub fn median(&self) -> f64 {
-        let mut sorted = self.0.clone();
-        let middle = sorted.len() / 2;
-        let (_, median, _) = sorted.select_nth_unstable_by(middle, f64::total_cmp);
-        *median
+        median(self.0.iter().copied())
     }
 }
 

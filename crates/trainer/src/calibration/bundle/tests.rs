@@ -71,6 +71,10 @@ fn around(lens: Lens, step: f64) -> Capture {
     }
 }
 
+fn viewmat(view: &View) -> DMat4 {
+    view.camera().viewmat
+}
+
 fn adjust(capture: &Capture) -> BundleAdjustment {
     adjust_bundle(capture).unwrap().unwrap()
 }

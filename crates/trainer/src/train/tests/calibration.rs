@@ -151,6 +151,62 @@ fn poses_begin_where_the_keypoints_are() {
     assert_eq!(resumed.model.to_data().means, trained.model.to_data().means);
 }
 
+/// Views that were not adjusted have their way still to go.
+#[test]
+fn poses_are_fast_unless_all_were_adjusted() {
+    let moved = |keep: &dyn Fn(u32) -> bool, intrinsics: bool| {
+        let mut turned = turned_with_keypoints();
+        turned
+            .observations
+            .retain(|observation| keep(observation.view));
+        let calibration = CalibrationSettings::new()
+            .with_poses(true)
+            .with_intrinsics(intrinsics);
+        let settings = TrainSettings::new()
+            .with_steps(8)
+            .with_calibration(calibration);
+        let turned = Arc::new(turned);
+        let trainer = builder_on(turned.clone())
+            .settings(settings)
+            .build()
+            .unwrap();
+        let adjusted = trainer.bundle_adjustment().unwrap().clone();
+        let cameras = trainer.run().unwrap().cameras(&turned).unwrap();
+        let off = |(index, before): (&usize, &DMat4)| {
+            let off = (cameras[*index].viewmat - *before).to_cols_array();
+            off.iter().fold(0.0, |most: f64, x| most.max(x.abs()))
+        };
+        let views = turned.split.train.iter().zip(&adjusted.viewmats);
+        views.map(off).fold(0.0, f64::max)
+    };
+    let first = capture().split.train[0] as u32;
+    let slow = moved(&|_| true, false);
+    let (left_out, with_lens) = (moved(&|view| view != first, false), moved(&|_| true, true));
+    assert!(
+        slow < 1e-4 && left_out > 1e-3 && with_lens > 1e-3,
+        "{slow} {left_out} {with_lens}"
+    );
+}
+
+#[test]
+fn too_few_keypoints_are_said() {
+    let mut turned = turned_with_keypoints();
+    turned.observations.truncate(20);
+    let calibration = CalibrationSettings::new().with_poses(true);
+    let settings = TrainSettings::new()
+        .with_steps(1)
+        .with_calibration(calibration);
+    let warnings = Arc::new(Mutex::new(Vec::new()));
+    let said = warnings.clone();
+    let trainer = builder_on(Arc::new(turned))
+        .settings(settings)
+        .on_warning(move |warning| said.lock().unwrap().push(warning.clone()))
+        .build()
+        .unwrap();
+    assert!(trainer.bundle_adjustment().is_none());
+    assert_eq!(*warnings.lock().unwrap(), [Warning::TooFewKeypoints]);
+}
+
 #[test]
 fn keypoints_of_other_photos_are_left_aside() {
     let mut other = turned_with_keypoints();

@@ -6,7 +6,8 @@ use glam::DVec3;
 use rayon::prelude::*;
 use splat_data::SplatData;
 
-use super::{Warning, median, quantile};
+use super::Warning;
+use crate::quantile::{median, quantile};
 use crate::train::TrainSettings;
 use splat_data::{Capture, View};
 

@@ -1,6 +1,7 @@
 //! Checks of the losses, after every quarter of a run.
 
-use super::{Warning, median};
+use super::Warning;
+use crate::quantile::median;
 use crate::train::LossRecord;
 
 /// Smallest number of losses by which a view is judged; the median of fewer may be a single bad
