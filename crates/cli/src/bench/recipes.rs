@@ -24,13 +24,11 @@ use super::{Failure, GlobalArgs, device, print, write, write_svg};
 use crate::command_line::CommandLine;
 use crate::interrupt;
 use crate::report::{probe_file, probe_folder};
-use crate::train::recipe_names;
 use csv::Table;
 use measure::Bench;
 use page::Page;
-use plan::Plan;
+use plan::{Named, Plan};
 use splat_lab::performance::Machine;
-use splat_trainer::{RECIPES, Recipe};
 use turns::{Ended, Turns};
 
 /// The rows of all runs.
@@ -47,6 +45,7 @@ const MOST_SEEDS: u64 = 1000;
 #[command(after_help = "Examples:
   splat bench recipes examples/data/saharov --downscale 4 --steps 2000
   splat bench recipes garden/ truck/ --recipes default,mcmc --downscale 4 --out out/compared
+  splat bench recipes garden/ --recipes default,mine.toml --downscale 4
 
 Trains every recipe on every capture with every seed, in turns, and writes to DIR: recipes.csv (a row
 for each run, saved as soon as it ends), recipes.md (the tables that are printed), recipes.svg, and for
@@ -57,8 +56,9 @@ pub(super) struct RecipesArgs {
     /// Captures: folders with `images/` and `sparse/0/`
     #[arg(required = true, value_name = "CAPTURE")]
     captures: Vec<PathBuf>,
-    /// Recipes to measure [default: all]
-    #[arg(long, value_name = "NAME,NAME,...", value_delimiter = ',', value_parser = recipe_names())]
+    /// Recipes to measure, or files as for `splat train --config`; the others are compared with the
+    /// first [default: all recipes]
+    #[arg(long, value_name = "NAME|FILE,...", value_delimiter = ',')]
     recipes: Vec<String>,
     /// Number of steps of a run; the recipe's milestones scale with it [default: the recipe's,
     /// 30000]
@@ -85,7 +85,7 @@ pub(super) fn run(args: &RecipesArgs, global: &GlobalArgs) -> Result<(), Failure
             "--seed: the runs have the seeds 0, 1, ...; say how many with --seeds".to_owned(),
         ));
     }
-    let mut plan = Plan::new(args.recipes(), args.seeds, args.steps, args.downscale)?;
+    let mut plan = Plan::new(args.recipes()?, args.seeds, args.steps, args.downscale)?;
     plan.take_captures(&args.captures, &args.out)?;
     let chosen = device::open(global)?;
     plan.device = chosen.name.clone();
@@ -112,12 +112,16 @@ pub(super) fn run(args: &RecipesArgs, global: &GlobalArgs) -> Result<(), Failure
 }
 
 impl RecipesArgs {
-    /// The chosen recipes, or all, in the order of [`RECIPES`].
-    fn recipes(&self) -> Vec<Recipe> {
-        let chosen = |recipe: &&Recipe| {
-            self.recipes.is_empty() || self.recipes.iter().any(|name| name == recipe.name)
-        };
-        RECIPES.iter().filter(chosen).copied().collect()
+    /// The chosen recipes, or all.
+    fn recipes(&self) -> Result<Vec<Named>, Failure> {
+        match self.recipes.is_empty() {
+            true => Ok(Named::recipes()),
+            false => self
+                .recipes
+                .iter()
+                .map(|text| Named::of_text(text))
+                .collect(),
+        }
     }
 
     /// Checks that everything can be written, before the long work.

@@ -62,7 +62,7 @@ fn recipes_are_compared_and_nothing_is_trained_twice() {
     assert_eq!(width("capture.png"), 3 * one + 2 * 4);
     let page = fs::read_to_string(out.join("recipes.md")).unwrap();
     assert!(page.contains(&said), "{page}");
-    assert!(page.contains("the photo, default, mcmc."), "{page}");
+    assert!(page.contains("the photo, mcmc, default."), "{page}");
     let svg = fs::read_to_string(out.join("recipes.svg")).unwrap();
     assert!(svg.contains("mcmc") && svg.contains("</svg>"));
     // The scenes that were weighed are gone.

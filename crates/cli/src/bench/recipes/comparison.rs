@@ -1,10 +1,8 @@
-//! Means over seeds and captures, and the recipes against the default one.
+//! Means over seeds and captures, and the recipes against the first one.
 
 use super::row::Row;
 use super::statistics::{Mean, geometric};
 
-/// The recipe that the others are compared with.
-pub(super) const BASE: &str = "default";
 /// Bytes of a megabyte.
 const MEGABYTE: f64 = 1e6;
 
@@ -43,11 +41,11 @@ pub(super) struct Overall<'a> {
     pub seconds: f64,
     /// Megabytes as SPZ.
     pub megabytes: f64,
-    /// Compared with [`BASE`], unless it is that, or no run has its counterpart.
+    /// Compared with the first recipe, unless it is that, or no run has its counterpart.
     pub against: Option<Against>,
 }
 
-/// Runs compared with those of [`BASE`] on the same capture with the same seed.
+/// Runs compared with those of the first recipe on the same capture with the same seed.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Against {
     /// Number of pairs.
@@ -88,9 +86,10 @@ pub(super) fn on_captures<'a>(rows: &[&'a Row]) -> Vec<OnCapture<'a>> {
         .collect()
 }
 
-/// Every one of the recipes that has rows.
+/// Every one of the recipes that has rows. All are compared with the first.
 pub(super) fn overall<'a>(recipes: &[&'a str], rows: &[&Row]) -> Vec<Overall<'a>> {
     let on_captures = on_captures(rows);
+    let base = recipes.first().copied().unwrap_or_default();
     let of_recipe = |&recipe: &&'a str| {
         let own: Vec<&OnCapture> = on_captures
             .iter()
@@ -107,15 +106,15 @@ pub(super) fn overall<'a>(recipes: &[&'a str], rows: &[&Row]) -> Vec<Overall<'a>
             gaussians: mean(|one| one.gaussians),
             seconds: mean(|one| one.seconds),
             megabytes: mean(|one| one.megabytes),
-            against: against(recipe, rows),
+            against: against(recipe, base, rows),
         })
     };
     recipes.iter().filter_map(of_recipe).collect()
 }
 
-fn against(recipe: &str, rows: &[&Row]) -> Option<Against> {
-    let pairs = pairs(recipe, rows);
-    if recipe == BASE || pairs.is_empty() {
+fn against(recipe: &str, base: &str, rows: &[&Row]) -> Option<Against> {
+    let pairs = pairs(recipe, base, rows);
+    if recipe == base || pairs.is_empty() {
         return None;
     }
     let each = |value: fn(&Row, &Row) -> f64| -> Vec<f64> {
@@ -133,11 +132,11 @@ fn against(recipe: &str, rows: &[&Row]) -> Option<Against> {
     })
 }
 
-/// Each run of a recipe with the run of [`BASE`] on the same capture with the same seed.
-fn pairs<'a>(recipe: &str, rows: &[&'a Row]) -> Vec<(&'a Row, &'a Row)> {
+/// Each run of a recipe with the run of another on the same capture with the same seed.
+fn pairs<'a>(recipe: &str, base: &str, rows: &[&'a Row]) -> Vec<(&'a Row, &'a Row)> {
     let of_base = |row: &Row| {
         let same = |other: &&&'a Row| {
-            other.key.recipe == BASE
+            other.key.recipe == base
                 && other.key.capture == row.key.capture
                 && other.key.seed == row.key.seed
         };
@@ -153,6 +152,8 @@ fn pairs<'a>(recipe: &str, rows: &[&'a Row]) -> Vec<(&'a Row, &'a Row)> {
 mod tests {
     use super::super::row::example;
     use super::*;
+
+    const BASE: &str = "default";
 
     /// Two captures of which the second has one seed of `mcmc` without a counterpart.
     fn rows() -> Vec<Row> {
@@ -199,7 +200,7 @@ mod tests {
     fn recipes_are_compared_where_both_were_measured() {
         let rows = rows();
         let rows: Vec<&Row> = rows.iter().collect();
-        let overall = overall(&["fast", BASE, "mcmc"], &rows);
+        let overall = overall(&[BASE, "fast", "mcmc"], &rows);
         assert_eq!(overall.len(), 2);
         assert_eq!((overall[0].recipe, overall[0].captures), (BASE, 2));
         assert_eq!(overall[0].psnr, 0.5 * (20.5 + 30.0));

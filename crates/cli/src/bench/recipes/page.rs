@@ -4,7 +4,7 @@ use std::fmt::Write;
 use std::time::Duration;
 
 use super::SVG;
-use super::comparison::{BASE, OnCapture, Overall, on_captures, overall};
+use super::comparison::{OnCapture, Overall, on_captures, overall};
 use super::pictures::Pictured;
 use super::plan::Plan;
 use super::row::Row;
@@ -87,18 +87,20 @@ impl Page<'_> {
             write_on_capture(text, &row)?;
         }
         let captures = self.plan.captures.len();
+        let recipes = self.plan.recipes.iter();
+        let recipes: Vec<&str> = recipes.map(|recipe| recipe.name.as_str()).collect();
+        let base = recipes.first().copied().unwrap_or_default();
         writeln!(
             text,
-            "\nMeans over captures, of {captures}, and against `{BASE}` on the same captures with the same seeds: the mean \
+            "\nMeans over captures, of {captures}, and against `{base}` on the same captures with the same seeds: the mean \
              difference with its standard error over the pairs of runs, and geometric means of the ratios.\n"
         )?;
         writeln!(
             text,
-            "| recipe | captures | PSNR dB | SSIM | Gaussians | seconds | MB as SPZ | pairs | dB against `{BASE}` | Gaussians | \
+            "| recipe | captures | PSNR dB | SSIM | Gaussians | seconds | MB as SPZ | pairs | dB against `{base}` | Gaussians | \
              seconds | bytes |"
         )?;
         writeln!(text, "|---|{}", "--:|".repeat(11))?;
-        let recipes: Vec<&str> = self.plan.recipes.iter().map(|recipe| recipe.name).collect();
         for row in overall(&recipes, self.rows) {
             write_overall(text, &row)?;
         }
@@ -156,14 +158,15 @@ fn write_overall(text: &mut String, row: &Overall<'_>) -> std::fmt::Result {
 
 #[cfg(test)]
 mod tests {
-    use super::super::plan::Subject;
+    use super::super::plan::{Named, Subject};
     use super::super::row::example;
     use super::*;
-    use splat_trainer::Recipe;
+
+    const BASE: &str = "default";
 
     #[test]
     fn the_page_has_both_tables_and_the_share() {
-        let recipes = [BASE, "mcmc"].map(|name| Recipe::of_name(name).unwrap());
+        let recipes = [BASE, "mcmc"].map(|name| Named::of_text(name).unwrap());
         let plan = Plan {
             captures: vec![Subject {
                 name: "a|b".to_owned(),

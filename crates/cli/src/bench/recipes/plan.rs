@@ -5,14 +5,61 @@ use std::path::{Path, PathBuf};
 use super::pictures;
 use super::row::{Key, Row, digest};
 use crate::report::refuse_inputs;
+use crate::text::read_config;
 use crate::{Failure, GlobalArgs, photos};
 use splat_data::{Capture, CaptureSettings};
-use splat_trainer::{Recipe, TrainSettings};
+use splat_trainer::{RECIPES, Recipe, TrainSettings};
+
+/// A recipe, or the settings of a file.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Named {
+    pub name: String,
+    pub settings: TrainSettings,
+}
+
+impl Named {
+    /// All recipes.
+    pub(super) fn recipes() -> Vec<Self> {
+        RECIPES.iter().map(Self::from).collect()
+    }
+
+    /// The recipe of this name, or else the settings of the file at this path, under its name
+    /// without `.toml`.
+    pub(super) fn of_text(text: &str) -> Result<Self, Failure> {
+        if let Some(recipe) = Recipe::of_name(text) {
+            return Ok(Self::from(&recipe));
+        }
+        let path = Path::new(text);
+        if !path.exists() {
+            let names: Vec<&str> = RECIPES.iter().map(|recipe| recipe.name).collect();
+            return Err(Failure::BadInput(format!(
+                "--recipes: {text} is neither a file nor a recipe; recipes are {}",
+                names.join(", ")
+            )));
+        }
+        let settings = read_config(path)?;
+        let name = path.file_stem().unwrap_or_default().to_string_lossy();
+        Ok(Self {
+            name: name.into_owned(),
+            settings,
+        })
+    }
+}
+
+impl From<&Recipe> for Named {
+    fn from(recipe: &Recipe) -> Self {
+        Self {
+            name: recipe.name.to_owned(),
+            settings: recipe.settings(),
+        }
+    }
+}
 
 /// Recipes, captures and seeds.
 pub(super) struct Plan {
     pub captures: Vec<Subject>,
-    pub recipes: Vec<Recipe>,
+    /// The first is the one that the others are compared with.
+    pub recipes: Vec<Named>,
     /// Number of seeds, from 0 on.
     pub seeds: u64,
     /// Steps of a run, if they are not the recipe's.
@@ -33,7 +80,7 @@ pub(super) struct Subject {
 pub(super) struct Run {
     /// Index of its capture in [`Plan::captures`].
     pub capture: usize,
-    pub recipe: Recipe,
+    pub recipe: Named,
     pub key: Key,
     /// Digest of the program's version, the folder of the capture and all settings: a result is of
     /// this run only if it has the same.
@@ -43,12 +90,19 @@ pub(super) struct Run {
 impl Plan {
     /// A plan without captures. Settings that cannot be used are refused.
     pub(super) fn new(
-        recipes: Vec<Recipe>,
+        recipes: Vec<Named>,
         seeds: u64,
         steps: Option<usize>,
         downscale: u32,
     ) -> Result<Self, Failure> {
-        for recipe in &recipes {
+        for (index, recipe) in recipes.iter().enumerate() {
+            let same = |other: &Named| other.name.to_lowercase() == recipe.name.to_lowercase();
+            if recipes[..index].iter().any(same) {
+                return Err(Failure::BadInput(format!(
+                    "--recipes: two are called {}, and results go by that name",
+                    recipe.name
+                )));
+            }
             let settings = settings(recipe, steps, downscale, 0);
             settings.validate().map_err(|problem| {
                 Failure::BadInput(format!("settings of {}: {problem}", recipe.name))
@@ -121,10 +175,10 @@ impl Plan {
                     runs.push(Run {
                         digest: digest(&format!("{version} {} {settings:?}", folder.display())),
                         capture,
-                        recipe: *recipe,
+                        recipe: recipe.clone(),
                         key: Key {
                             capture: subject.name.clone(),
-                            recipe: recipe.name.to_owned(),
+                            recipe: recipe.name.clone(),
                             seed,
                             steps: settings.steps,
                             downscale: self.downscale,
@@ -146,7 +200,7 @@ impl Plan {
     /// The rows of the plan's runs: by capture, then by recipe, then by seed.
     pub(super) fn measured<'a>(&self, rows: &'a [Row]) -> Vec<&'a Row> {
         let mut runs = self.runs();
-        let place = |recipe: &Recipe| self.recipes.iter().position(|known| known == recipe);
+        let place = |recipe: &Named| self.recipes.iter().position(|known| known == recipe);
         runs.sort_by_key(|run| (run.capture, place(&run.recipe), run.key.seed));
         runs.iter().filter_map(|run| run.row(rows)).collect()
     }
@@ -189,13 +243,13 @@ impl std::fmt::Display for Run {
 }
 
 /// The settings of a recipe for a run.
-fn settings(recipe: &Recipe, steps: Option<usize>, downscale: u32, seed: u64) -> TrainSettings {
-    let own = recipe.settings();
+fn settings(recipe: &Named, steps: Option<usize>, downscale: u32, seed: u64) -> TrainSettings {
+    let own = &recipe.settings;
     TrainSettings {
         steps: steps.unwrap_or(own.steps),
         seed,
         downscale,
-        ..own
+        ..own.clone()
     }
 }
 
@@ -206,7 +260,7 @@ mod tests {
 
     /// Two captures, two recipes and two seeds.
     fn plan() -> Plan {
-        let recipes = ["default", "mcmc"].map(|name| Recipe::of_name(name).unwrap());
+        let recipes = ["default", "mcmc"].map(|name| Named::of_text(name).unwrap());
         let subject = |name: &str| Subject {
             name: name.to_owned(),
             folder: name.into(),
@@ -307,12 +361,33 @@ mod tests {
 
     #[test]
     fn unusable_settings_are_refused() {
-        let recipe = Recipe::of_name("default").unwrap();
-        let refused = Plan::new(vec![recipe], 1, Some(0), 1).err().unwrap();
-        let words = refused.to_string();
+        let recipe = Named::of_text("default").unwrap();
+        let refused = |recipes, steps| Plan::new(recipes, 1, steps, 1).err().unwrap().to_string();
+        let words = refused(vec![recipe.clone(), recipe.clone()], None);
+        assert!(words.contains("two are called default"), "{words}");
+        let words = refused(vec![recipe], Some(0));
         assert!(
             words.contains("default") && words.contains("`steps`"),
             "{words}"
         );
+    }
+
+    #[test]
+    fn a_file_is_a_recipe_under_its_own_name() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("mine.toml");
+        std::fs::write(&path, "steps = 7\n").unwrap();
+        let named = Named::of_text(path.to_str().unwrap()).unwrap();
+        assert_eq!((&*named.name, named.settings.steps), ("mine", 7));
+        std::fs::write(&path, "stepps = 7\n").unwrap();
+        let words = Named::of_text(path.to_str().unwrap())
+            .unwrap_err()
+            .to_string();
+        assert!(
+            words.contains("mine.toml") && words.contains("stepps"),
+            "{words}"
+        );
+        let words = Named::of_text("no such").unwrap_err().to_string();
+        assert!(words.contains("default, 3dgs"), "{words}");
     }
 }

@@ -120,10 +120,11 @@ impl Panel<'_> {
     }
 }
 
-/// The colour of a recipe, the same in every plot.
+/// The colour of a recipe, the same in every plot. Those of files are chosen by the letters.
 fn color_of(recipe: &str) -> RGBAColor {
     let at = RECIPES.iter().position(|known| known.name == recipe);
-    Palette99::pick(at.unwrap_or(RECIPES.len())).to_rgba()
+    let letters = || recipe.bytes().map(usize::from).sum::<usize>();
+    Palette99::pick(at.unwrap_or_else(|| RECIPES.len() + letters() % 80)).to_rgba()
 }
 
 #[cfg(test)]
