@@ -164,11 +164,11 @@ fn fewer_bits(
     encoded
 }
 
-/// A scene from a file, with the settings of the original that the file cannot hold.
+/// A scene from a file, with what a viewer is told beside it. The size of the scene is not among
+/// that: where the file cannot hold it, planes follow from its Gaussians, here as for every reader.
 fn as_original(mut read: SplatData, original: &SplatData) -> SplatData {
     let (settings, before) = (&mut read.settings, &original.settings);
     settings.background = settings.background.or(before.background);
-    settings.scene_scale = settings.scene_scale.or(before.scene_scale);
     settings.antialias = settings.antialias.or(before.antialias);
     read
 }
