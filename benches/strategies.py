@@ -29,6 +29,8 @@ ARMS = {
 }
 
 
+# Strategies are compared with the rates that their constants are for.
+RATES = "[learning_rates]\nshort_run_exponent = 0.0\n"
 DOCS = Path(__file__).parents[1] / "docs"
 FIGURES = ("psnr", "ssim", "gaussians", "processor_seconds")
 
@@ -65,7 +67,7 @@ def train(splat, capture, arm, seed):
     _, text, divisor = ARMS[arm]
     with tempfile.TemporaryDirectory() as folder:
         out, config = Path(folder) / "run", Path(folder) / "run.toml"
-        config.write_text(text)
+        config.write_text(text + RATES)
         command = [splat, "--device", "cpu", "--seed", seed, "--quiet", "train", capture, "--downscale", 2]
         command += ["--steps", STEPS, "--config", config, "--out", out]
         cap = None

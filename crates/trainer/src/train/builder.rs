@@ -410,7 +410,7 @@ fn optimized<M: SplatModel>(
     scene: SceneScale,
     optimizer: &MakeOptimizer,
 ) -> Result<Optimized<M>, TrainError> {
-    let fields = model.fields(&config.learning_rates);
+    let fields = model.fields(&config.learning_rates.for_steps(config.steps));
     let usual = |field: &Field| SplatAdam::of_field(field, config.adam_rows(), scene).into();
     let optimizer = |field: &Field| optimizer(field).unwrap_or_else(|| usual(field));
     Optimized::new(model, fields, optimizer).map_err(|error| TrainError::Setup(error.to_string()))

@@ -360,6 +360,12 @@ impl TrainSettings {
                 "`{field}` must be positive and finite, it is {value}"
             ));
         }
+        if !(0.0..=1.0).contains(&rates.short_run_exponent) {
+            let exponent = rates.short_run_exponent;
+            return Err(format!(
+                "`learning_rates.short_run_exponent` must lie in [0, 1], it is {exponent}"
+            ));
+        }
         // Infinity is a way to say never.
         let not_negative = [
             ("density.grow_gradient", self.density.threshold()),

@@ -180,6 +180,22 @@ fn a_run_outlives_its_autosaves() {
 /// A run does not resume from another run: another capture, other settings, another loss. Photos
 /// whose pixels alone have changed are named.
 #[test]
+fn a_short_run_has_higher_rates_unless_the_settings_say_otherwise() {
+    let rates = |exponent: f64| {
+        let mut settings = TrainSettings::new().with_steps(1_875);
+        settings.learning_rates.short_run_exponent = exponent;
+        let trainer = builder().settings(settings).build().unwrap();
+        let rate = |name: &str| {
+            let mut fields = trainer.state.model.fields().iter();
+            fields.find(|field| field.name == name).unwrap().rate
+        };
+        ["means", "sh0", "opacity_logits"].map(rate)
+    };
+    assert_eq!(rates(0.0), [1.6e-4, 2.5e-3, 0.05]);
+    assert_eq!(rates(0.5), [4.0 * 1.6e-4, 2.0 * 2.5e-3, 0.05]);
+}
+
+#[test]
 fn a_checkpoint_is_of_one_run() {
     let first = builder()
         .interrupt(Arc::new(AtomicBool::new(true)))
