@@ -10,11 +10,12 @@
 //! takes no step, 4 bytes read.
 
 use cubecl::prelude::*;
-use splat_core::{AdamRows, AdamStep};
+use splat_core::{AdamGap, AdamRows, AdamStep, RowGroups};
 
 use crate::bytes::{Bytes, Sizes};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
 use crate::math::is_finite;
+use crate::row_groups::row_of;
 
 /// Weights of the old moments and of the new values, in this order; rate; epsilon.
 #[derive(CubeType, CubeLaunch, Clone, Copy)]
@@ -132,6 +133,74 @@ fn adam_seen_rows(
     }
 }
 
+/// Steps the rows of some groups; the gradient has rows for these alone. `group` is the number of
+/// values of a whole group.
+#[cube(launch)]
+fn adam_groups(
+    param: &[f32],
+    grad: &[f32],
+    moment_1: &[f32],
+    moment_2: &[f32],
+    groups: &[u32],
+    param_out: &mut [f32],
+    moment_1_out: &mut [f32],
+    moment_2_out: &mut [f32],
+    numbers: Numbers,
+    len: u32,
+    group: u32,
+    width: u32,
+    #[comptime] seen_rows: bool,
+) {
+    let i = ABSOLUTE_POS;
+    if i < len as usize {
+        let mut steps = true;
+        if comptime!(seen_rows) {
+            // Every unit looks through its row: groups are few, and their rows in cache.
+            let first = i - i % width as usize;
+            steps = false;
+            for value in 0..width as usize {
+                if is_seen(grad[first + value]) {
+                    steps = true;
+                }
+            }
+        }
+        if steps {
+            let at = row_of(groups, i, group as usize);
+            let after = stepped(param[at], grad[i], moment_1[at], moment_2[at], numbers);
+            param_out[at] = after.param;
+            moment_1_out[at] = after.moment_1;
+            moment_2_out[at] = after.moment_2;
+        }
+    }
+}
+
+/// Does to the rows of some groups what steps without a gradient do. `gaps` has four numbers for
+/// each: what is kept of the first moment and of the second, step, epsilon.
+#[cube(launch)]
+fn adam_catch_up_groups(
+    param: &[f32],
+    moment_1: &[f32],
+    moment_2: &[f32],
+    groups: &[u32],
+    gaps: &[f32],
+    param_out: &mut [f32],
+    moment_1_out: &mut [f32],
+    moment_2_out: &mut [f32],
+    len: u32,
+    group: u32,
+) {
+    let i = ABSOLUTE_POS;
+    if i < len as usize {
+        let at = row_of(groups, i, group as usize);
+        let gap = i / group as usize * 4;
+        let m = moment_1[at];
+        let v = moment_2[at];
+        param_out[at] = param[at] - m / (f32::sqrt(v) + gaps[gap + 3]) * gaps[gap + 2];
+        moment_1_out[at] = m * gaps[gap];
+        moment_2_out[at] = v * gaps[gap + 1];
+    }
+}
+
 /// Floor of a step of all parameters.
 pub(crate) fn floor(sizes: &Sizes) -> Bytes {
     let values = sizes.gaussians * sizes.parameters;
@@ -167,6 +236,99 @@ pub fn adam(
             seen_rows(client, inputs, outputs, step, [len, width.max(1)], copied);
         }
     }
+    [param, moment_1, moment_2]
+}
+
+/// Steps some rows of a parameter and its moments, given the gradient of these rows alone, in rows
+/// of `width`. The others keep their values.
+pub fn adam_rows(
+    client: &Client,
+    param: Buffer,
+    grad: &Buffer,
+    moments: [Buffer; 2],
+    step: &AdamStep,
+    width: usize,
+    rows: &RowGroups,
+) -> [Buffer; 3] {
+    let [moment_1, moment_2] = moments;
+    let buffers = [param, moment_1, moment_2].map(|buffer| buffer.owned(client));
+    let len = (rows.len() * width).min(grad.len());
+    let fits = buffers
+        .iter()
+        .all(|buffer| buffer.len() >= rows.count() * width);
+    let Some((count, dim)) = per_element(len).filter(|_| fits && width > 0) else {
+        return buffers;
+    };
+    let groups = Buffer::from_u32(client, rows.chosen());
+    let [param, moment_1, moment_2] = buffers;
+    let (param, [param_in, param_out]) = param.overwritten(client, 0);
+    let (moment_1, [moment_1_in, moment_1_out]) = moment_1.overwritten(client, 2);
+    let (moment_2, [moment_2_in, moment_2_out]) = moment_2.overwritten(client, 3);
+    adam_groups::launch(
+        client,
+        count,
+        dim,
+        param_in,
+        grad.arg(),
+        moment_1_in,
+        moment_2_in,
+        groups.arg(),
+        param_out,
+        moment_1_out,
+        moment_2_out,
+        numbers(step),
+        len as u32,
+        (rows.size() * width) as u32,
+        width as u32,
+        step.rows == AdamRows::Seen,
+    );
+    [param, moment_1, moment_2]
+}
+
+/// Does to some rows of a parameter and its moments what steps without a gradient do; a gap for
+/// each group. The other rows keep their values.
+pub fn adam_catch_up(
+    client: &Client,
+    param: Buffer,
+    moments: [Buffer; 2],
+    width: usize,
+    rows: &RowGroups,
+    gaps: &[AdamGap],
+) -> [Buffer; 3] {
+    let [moment_1, moment_2] = moments;
+    let buffers = [param, moment_1, moment_2].map(|buffer| buffer.owned(client));
+    let len = rows.len() * width;
+    let fits = gaps.len() == rows.chosen().len()
+        && buffers
+            .iter()
+            .all(|buffer| buffer.len() >= rows.count() * width);
+    let Some((count, dim)) = per_element(len).filter(|_| fits) else {
+        return buffers;
+    };
+    let groups = Buffer::from_u32(client, rows.chosen());
+    let gaps: Vec<f32> = (gaps.iter())
+        .flat_map(|gap| [gap.keep_1, gap.keep_2, gap.step, gap.epsilon].map(|value| value as f32))
+        .collect();
+    let gaps = Buffer::from_f32(client, &gaps);
+    let [param, moment_1, moment_2] = buffers;
+    let (param, [param_in, param_out]) = param.overwritten(client, 0);
+    let (moment_1, [moment_1_in, moment_1_out]) = moment_1.overwritten(client, 1);
+    let (moment_2, [moment_2_in, moment_2_out]) = moment_2.overwritten(client, 2);
+    adam_catch_up_groups::launch(
+        client,
+        count,
+        dim,
+        param_in,
+        moment_1_in,
+        moment_2_in,
+        groups.arg(),
+        gaps.arg(),
+        param_out,
+        moment_1_out,
+        moment_2_out,
+        len as u32,
+        (rows.size() * width) as u32,
+    );
     [param, moment_1, moment_2]
 }
 

@@ -1,4 +1,5 @@
-//! A copy, to measure the device's memory bandwidth.
+//! A copy, for buffers of which a kernel overwrites a part, and to measure the device's memory
+//! bandwidth.
 //!
 //! Floor per value: 4 bytes read, 4 written, no operation. Any memory-bound stage can reach the
 //! bandwidth of this kernel.
@@ -16,6 +17,15 @@ fn copy_values(from: &[f32], to: &mut [f32], len: u32) {
     if i < len as usize {
         to[i] = from[i];
     }
+}
+
+/// The same elements in memory of their own.
+pub(crate) fn copied(client: &Client, from: &Buffer) -> Buffer {
+    let to = Buffer::empty(client, from.len());
+    if let Some((cubes, dim)) = per_element(from.len()) {
+        copy_values::launch(client, cubes, dim, from.arg(), to.arg(), from.len() as u32);
+    }
+    to
 }
 
 /// Bytes read and written per second by a kernel that copies `len` floats, one per unit: the best

@@ -9,6 +9,7 @@ use cubecl::ir::{ElemType, FloatKind};
 use cubecl::prelude::*;
 use cubecl::server::{Handle, ServerError};
 
+use crate::copy::copied;
 use crate::work;
 
 /// Units of a workgroup in every one-dimensional kernel.
@@ -145,6 +146,14 @@ impl Buffer {
     /// True if something else holds the memory too.
     pub(crate) fn is_held(&self) -> bool {
         !self.handle.can_mut()
+    }
+
+    /// The same elements, in memory that nothing else holds.
+    pub(crate) fn owned(self, client: &Client) -> Self {
+        match self.is_held() {
+            true => copied(client, &self),
+            false => self,
+        }
     }
 
     /// Prepares a kernel that reads this buffer as its buffer number `position` and writes a result

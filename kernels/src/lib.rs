@@ -34,6 +34,7 @@ mod planes;
 pub mod project;
 pub mod rasterize;
 mod reduce;
+mod row_groups;
 pub mod scan;
 pub mod screen_statistics;
 pub mod sh;

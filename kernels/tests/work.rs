@@ -115,7 +115,7 @@ fn results_take_the_memory_of_what_nothing_else_holds() {
     ];
     let held = sums[0].clone();
     let before = work();
-    let [lengths, views] = screen_statistics(&client, [&step, &packed], sums, [2.0, 2.0]);
+    let [lengths, views] = screen_statistics(&client, [&step, &packed], sums, [2.0, 2.0], None);
     assert_eq!(work().since(before).reserved_bytes, 4, "one sum is held");
     let read = |buffer: Buffer| buffer.read_f32(&client).unwrap();
     assert_eq!([held, lengths, views].map(read), [[1.0], [11.0], [8.0]]);

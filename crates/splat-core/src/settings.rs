@@ -226,6 +226,30 @@ pub struct AdamStep {
     pub rows: AdamRows,
 }
 
+/// What several steps of Adam without a gradient do to a row: `p = p - step m / (sqrt(v) +
+/// epsilon)`, then `m = keep_1 m`, `v = keep_2 v`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AdamGap {
+    /// Product of the decays of the first moment.
+    pub keep_1: f64,
+    /// Product of the decays of the second moment.
+    pub keep_2: f64,
+    /// Sum of the steps' rates, each times what is left of `m / sqrt(v)` then.
+    pub step: f64,
+    /// Added to the root of the second moment.
+    pub epsilon: f64,
+}
+
+impl AdamGap {
+    /// No steps.
+    pub const NONE: Self = Self {
+        keep_1: 1.0,
+        keep_2: 1.0,
+        step: 0.0,
+        epsilon: 1.0,
+    };
+}
+
 /// Rows of a parameter, along its first dimension, that a step changes.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum AdamRows {

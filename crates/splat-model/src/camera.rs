@@ -1,8 +1,9 @@
 //! Cameras as tensors.
 
 use burn::tensor::{Device, Tensor, TensorData};
-use splat_data::Camera;
-use splat_ops::{Distortion, ImageSize, Intrinsics};
+use glam::DMat4;
+use splat_data::{Camera, CameraModel, Lens};
+use splat_ops::{Distortion, ImageSize, Intrinsics, OpError};
 
 /// C cameras of one image size, as tensors. Call `require_grad` on them to refine poses or
 /// intrinsics.
@@ -61,6 +62,45 @@ impl CameraTensors {
             distortion,
             size: camera.size,
         }
+    }
+
+    /// The cameras as they are now, read back; waits for the device.
+    ///
+    /// # Errors
+    /// When the device fails, or the shapes do not fit each other.
+    pub fn to_cameras(&self) -> Result<Vec<Camera>, OpError> {
+        let wrong = |what: String| OpError::Device {
+            op: "CameraTensors::to_cameras",
+            what,
+        };
+        let failed = |error: &dyn core::fmt::Display| wrong(error.to_string());
+        let viewmats = self.viewmats.clone().detach().try_into_vec_as::<f64>();
+        let viewmats = viewmats.map_err(|error| failed(&error))?;
+        let intrinsics = self.intrinsics.clone().detach().try_into_vec_as::<f64>();
+        let intrinsics = intrinsics.map_err(|error| failed(&error))?;
+        let (model, coefficients) = match &self.distortion {
+            None => (CameraModel::Pinhole, Vec::new()),
+            Some(distortion) => {
+                let values = distortion.coefficients.clone().detach();
+                let values = values.try_into_vec_as::<f64>();
+                (distortion.model, values.map_err(|error| failed(&error))?)
+            }
+        };
+        let width = model.coefficients();
+        let cameras = viewmats.as_chunks::<16>().0.iter();
+        let cameras = cameras.zip(intrinsics.as_chunks::<4>().0).enumerate();
+        cameras
+            .map(|(index, (viewmat, intrinsics))| {
+                let own = coefficients.get(index * width..(index + 1) * width);
+                let lens = own.and_then(|own| Lens::new(model, own));
+                Ok(Camera {
+                    viewmat: DMat4::from_cols_array(viewmat).transpose(),
+                    intrinsics: *intrinsics,
+                    lens: lens.ok_or_else(|| wrong("a lens lacks coefficients".to_owned()))?,
+                    size: self.size,
+                })
+            })
+            .collect()
     }
 
     /// The same cameras as constants, which pass no gradient on.

@@ -22,7 +22,7 @@ pub use field::{Field, GAUSSIANS};
 pub use gaussians::{Gaussians, ShPrecision};
 pub use init::{InitError, InitSettings, splats_from_points};
 pub use model::SplatModel;
-pub use optimized::{FieldGradients, FieldStep, Optimized};
+pub use optimized::{FieldGradients, FieldStep, Optimized, Part, SparseOptimized};
 pub use rates::LearningRates;
 pub use record::RecordError;
 pub use render::{

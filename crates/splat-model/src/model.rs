@@ -101,6 +101,14 @@ pub trait SplatModel: Module + 'static {
     fn count(&self) -> usize {
         self.means().dims()[0]
     }
+
+    /// True if every Gaussian depends on its own row of each field with rows, and on nothing of
+    /// other Gaussians; if centres are the field `means`, and scales the exponentials of the field
+    /// `log_scales`. A step can then leave out what its views do not see, see
+    /// [`SparseOptimized`](crate::SparseOptimized). Default false.
+    fn is_row_wise(&self) -> bool {
+        false
+    }
 }
 
 impl SplatModel for Gaussians {
@@ -159,5 +167,9 @@ impl SplatModel for Gaussians {
 
     fn count(&self) -> usize {
         self.len()
+    }
+
+    fn is_row_wise(&self) -> bool {
+        true
     }
 }

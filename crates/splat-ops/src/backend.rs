@@ -16,7 +16,8 @@ use burn::backend::{
 use burn::backend::{Autodiff, Dispatch};
 
 use crate::settings::{
-    Activation, AdamStep, Perturbation, ProjectArgs, RasterizeArgs, ShColorSettings, SsimArgs,
+    Activation, AdamGap, AdamStep, Perturbation, ProjectArgs, RasterizeArgs, RowGroups,
+    ShColorSettings, SsimArgs,
 };
 
 pub use splat_core::{
@@ -324,18 +325,36 @@ pub trait PhotometricBackend: PhotometricOps {
 /// [`ScreenStatistics::add`](crate::ScreenStatistics::add). Not differentiable.
 #[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
 pub trait ScreenStatisticsOps: Backend {
-    /// Adds the lengths of `half * gradient` and the views to the sums.
+    /// Adds the lengths of `half * gradient` and the views to the sums, of the given rows if the
+    /// splats are those of some alone.
     fn add_screen_statistics(
         #[extension_type] inputs: ScreenStatisticsInputs<Self>,
         half: [f64; 2],
+        rows: Option<RowGroups>,
     ) -> ScreenStatisticsOutputs<Self>;
 }
 
-/// [`adam_step`](crate::adam_step). Not differentiable.
+/// [`adam_step`](crate::adam_step), [`adam_step_groups`](crate::adam_step_groups) and
+/// [`adam_catch_up`](crate::adam_catch_up). Not differentiable.
 #[backend_extension(Cube: cfg(feature = "cube"), Flex: cfg(feature = "cpu"), Autodiff)]
 pub trait AdamOps: Backend {
     /// Parameter and moments after the step.
     fn adam(#[extension_type] inputs: AdamInputs<Self>, step: AdamStep) -> AdamOutputs<Self>;
+
+    /// The same for the given rows, of which the gradient has one each; others stay as they are.
+    fn adam_groups(
+        #[extension_type] inputs: AdamInputs<Self>,
+        step: AdamStep,
+        rows: RowGroups,
+    ) -> AdamOutputs<Self>;
+
+    /// Parameter and moments after steps without a gradient, of the given rows; a gap for each
+    /// group.
+    fn adam_catch_up(
+        #[extension_type] tensors: AdamOutputs<Self>,
+        rows: RowGroups,
+        gaps: Vec<AdamGap>,
+    ) -> AdamOutputs<Self>;
 }
 
 /// [`perturb_means`](crate::perturb_means). Not differentiable.

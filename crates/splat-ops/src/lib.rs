@@ -109,7 +109,7 @@ mod ssim;
 mod tests;
 
 pub use activation::{exp, sigmoid};
-pub use adam::adam_step;
+pub use adam::{adam_catch_up, adam_step, adam_step_groups};
 pub use blur::gaussian_blur;
 #[cfg(feature = "cpu")]
 pub use cpu::RasterizeWork;
@@ -125,8 +125,8 @@ pub use project::{Projected, project};
 pub use rasterize::{Rendered, rasterize};
 pub use screen_statistics::ScreenStatistics;
 pub use settings::{
-    Activation, AdamRows, AdamStep, CameraModel, ClampGradient, ImageSize, Perturbation,
-    ProjectSettings, RasterizeSettings, ShColorSettings, SsimArgs,
+    Activation, AdamGap, AdamRows, AdamStep, CameraModel, ClampGradient, ImageSize, Perturbation,
+    ProjectSettings, RasterizeSettings, RowGroups, ShColorSettings, SsimArgs,
 };
 pub use sh_colors::sh_colors;
 pub use spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count, spherical_harmonics};

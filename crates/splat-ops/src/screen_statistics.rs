@@ -5,6 +5,7 @@ use burn::tensor::Tensor;
 
 use crate::backend::{OpInputs, PROJECTED_WIDTH, ScreenStatisticsOps, ScreenStatisticsTensors};
 use crate::check::Checker;
+use crate::settings::RowGroups;
 use crate::{OpError, Projected};
 
 /// Sums over the views so far, per Gaussian.
@@ -28,15 +29,44 @@ impl ScreenStatistics {
     /// # Errors
     /// When shapes, types or devices do not fit.
     pub fn add(self, gradient: Tensor<3>, projected: &Projected) -> Result<Self, OpError> {
+        self.add_to(gradient, projected, None)
+    }
+
+    /// [`add`](Self::add) of the splats of some rows alone, N' of N: gradient `[C, N', 9]` or `[C,
+    /// N', 2]`, splats `[C, N', 9]`. The sums of others stay as they are.
+    ///
+    /// # Errors
+    /// When shapes, types or devices do not fit, or the rows are those of another number of
+    /// Gaussians.
+    pub fn add_rows(
+        self,
+        gradient: Tensor<3>,
+        projected: &Projected,
+        rows: &RowGroups,
+    ) -> Result<Self, OpError> {
+        self.add_to(gradient, projected, Some(rows))
+    }
+
+    fn add_to(
+        self,
+        gradient: Tensor<3>,
+        projected: &Projected,
+        rows: Option<&RowGroups>,
+    ) -> Result<Self, OpError> {
         // Autodiff has no part in this.
         let (gradient, packed) = (gradient.inner(), projected.packed().inner());
         let check = Checker::new("ScreenStatistics::add", "gradient", &gradient)?;
-        let [c, n, width] = gradient.dims();
-        let rows = [Some(c), Some(n), Some(PROJECTED_WIDTH)];
+        let [c, splats, width] = gradient.dims();
+        let shape = [Some(c), Some(splats), Some(PROJECTED_WIDTH)];
         if width != 2 {
-            check.tensor("gradient", &gradient, rows, "[C, N, 9] or [C, N, 2]")?;
+            check.tensor("gradient", &gradient, shape, "[C, N, 9] or [C, N, 2]")?;
         }
-        check.tensor("projected", &packed, rows, "[C, N, 9]")?;
+        check.tensor("projected", &packed, shape, "[C, N, 9]")?;
+        let n = rows.map_or(splats, RowGroups::count);
+        if let Some(rows) = rows.filter(|rows| rows.len() != splats) {
+            let rows = rows.len();
+            return Err(check.argument(format!("{splats} splats of {rows} rows")));
+        }
         check.tensor("gradients", &self.gradients, [Some(n)], "[N]")?;
         check.tensor("views", &self.views, [Some(n)], "[N]")?;
         // Pixels to half images, and the mean over cameras to a sum.
@@ -48,7 +78,7 @@ impl ScreenStatistics {
             gradients: self.gradients.into_dispatch(),
             views: self.views.into_dispatch(),
         });
-        let sums = Dispatch::add_screen_statistics(inputs, half);
+        let sums = Dispatch::add_screen_statistics(inputs, half, rows.cloned());
         Ok(Self {
             gradients: Tensor::from_dispatch(sums.gradients),
             views: Tensor::from_dispatch(sums.views),

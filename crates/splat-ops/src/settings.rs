@@ -1,8 +1,8 @@
 //! Sizes and settings of the ops. Every constant of the method is a field with a default.
 
 pub use splat_core::{
-    Activation, AdamRows, AdamStep, CameraModel, ClampGradient, ImageSize, Perturbation,
-    ProjectSettings, RasterizeSettings, ShColorSettings, SsimArgs,
+    Activation, AdamGap, AdamRows, AdamStep, CameraModel, ClampGradient, ImageSize, Perturbation,
+    ProjectSettings, RasterizeSettings, RowGroups, ShColorSettings, SsimArgs,
 };
 
 use crate::ErrorSlot;

@@ -65,7 +65,7 @@ fn first_step(unit: f64) -> Vec<(&'static str, Vec<f32>, i32)> {
     let settings = TrainSettings::default().render_settings(0, trainer.scene_scale());
     let camera = capture.views[3].camera().relative_to(gaussians.origin);
     let camera = CameraTensors::from_camera(&camera, &gaussians.means.device());
-    let image = render(gaussians, &camera, &settings).unwrap().image();
+    let image = render(&*gaussians, &camera, &settings).unwrap().image();
     let grads = (image.clone() - 0.4).square().mean().backward();
     let scales: Vec<f32> = host(gaussians.log_scales.val().exp());
     vec![

@@ -6,6 +6,7 @@ mod performance;
 mod rasterize;
 mod recipes;
 mod scaling;
+mod sparse;
 mod step;
 
 use std::path::{Path, PathBuf};
@@ -38,10 +39,12 @@ enum Bench {
     Step(step::StepArgs),
     Rasterize(rasterize::RasterizeArgs),
     Scaling(scaling::ScalingArgs),
+    Sparse(sparse::SparseArgs),
     Capture(scaling::SyntheticArgs),
     Performance(performance::PerformanceArgs),
     Recipes(recipes::RecipesArgs),
     Point(scaling::PointArgs),
+    SparseRun(sparse::RunArgs),
 }
 
 /// Runs the command.
@@ -51,6 +54,8 @@ pub(super) fn run(args: &BenchArgs, global: &GlobalArgs) -> Result<(), Failure> 
         Bench::Step(args) => step::run(args, global),
         Bench::Rasterize(args) => rasterize::run(args, global),
         Bench::Scaling(args) => scaling::run(args, global),
+        Bench::Sparse(args) => sparse::run(args, global),
+        Bench::SparseRun(args) => sparse::run_one(args, global),
         Bench::Capture(args) => scaling::run_synthetic(args),
         Bench::Performance(args) => performance::run(args, global),
         Bench::Recipes(args) => recipes::run(args, global),

@@ -1,5 +1,5 @@
-//! Speed, its breakdown by stage, and its growth: `splat bench step|rasterize|scaling`, on the CPU
-//! or a CubeCL device.
+//! Speed, its breakdown by stage, and its growth: `splat bench step|rasterize|scaling|sparse`, on
+//! the CPU or a CubeCL device.
 //!
 //! Nothing here duplicates the measured code: steps are those of the
 //! [`Trainer`](splat_trainer::Trainer), and stages are the `tracing` spans in it and in the ops.
@@ -12,6 +12,7 @@ mod machine;
 pub mod page;
 pub mod rasterize;
 pub mod scaling;
+pub mod sparse;
 mod spread;
 pub mod stages;
 pub mod step;

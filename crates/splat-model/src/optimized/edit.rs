@@ -20,6 +20,7 @@ impl<M: Module> Optimized<M> {
     pub fn edit_rows(&mut self, edit: &RowEdit) -> Result<(), OpError> {
         self.check_edit(edit)?;
         self.edits += 1;
+        self.version += 1;
         let device = match self
             .fields
             .iter()

@@ -3,6 +3,7 @@
 mod edit;
 mod fields;
 mod save;
+mod sparse;
 #[cfg(all(test, feature = "cpu"))]
 mod tests;
 
@@ -71,7 +72,11 @@ pub struct Optimized<M> {
     waiting: FieldGradients,
     /// Number of row edits so far.
     edits: usize,
+    /// Number of times that values have changed.
+    version: usize,
 }
+
+pub use sparse::{Part, SparseOptimized};
 
 impl<M: Module> Optimized<M> {
     /// A model with an optimiser for each of its fields.
@@ -92,6 +97,7 @@ impl<M: Module> Optimized<M> {
             optimizers,
             waiting: FieldGradients::new(),
             edits: 0,
+            version: 0,
         };
         trained.check_fields()?;
         Ok(trained)
@@ -322,6 +328,7 @@ impl<M: Module> Optimized<M> {
                 (_, FieldStep::Skip) => {}
             }
         }
+        self.version += 1;
         let names = self.names();
         let optimizers = &mut self.optimizers;
         change(&mut self.model, names, |name, value| {
@@ -371,6 +378,7 @@ impl<M: Module> Optimized<M> {
         })?;
         let updated = FieldGradients::from([(field.to_owned(), update(value))]);
         self.check_shapes("Optimized::update", &updated)?;
+        self.version += 1;
         let (names, mut updated) = (self.names(), updated);
         change(&mut self.model, names, |name, value| {
             updated.remove(name).unwrap_or(value)

@@ -101,6 +101,7 @@ impl<M: Module> Optimized<M> {
         if let Some(name) = fields.keys().next() {
             return Err(format!("`{name}` is no field of the model"));
         }
+        self.version += 1;
         self.waiting = waiting_gradients;
         let names = self.names();
         change(&mut self.model, names, |name, value| {

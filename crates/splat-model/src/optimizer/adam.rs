@@ -52,6 +52,21 @@ impl SplatAdam {
         }
         adam
     }
+
+    /// The constants of step number `time`, counted from 1.
+    pub(crate) fn step_at(&self, rate: f64, time: usize) -> AdamStep {
+        let time = time as f64;
+        let correction_1 = 1.0 - self.beta_1.powf(time);
+        let correction_2 = (1.0 - self.beta_2.powf(time)).sqrt();
+        // m / c1 / (sqrt(v) / c2 + eps) = (c2 / c1) m / (sqrt(v) + c2 eps)
+        AdamStep {
+            beta_1: self.beta_1,
+            beta_2: self.beta_2,
+            rate: rate * correction_2 / correction_1,
+            epsilon: self.epsilon * correction_2,
+            rows: self.rows,
+        }
+    }
 }
 
 /// Moments of one parameter.
@@ -98,18 +113,7 @@ impl Optimizer for SplatAdam {
             moment_2: grad.zeros_like(),
         });
         state.time += 1;
-        let time = state.time as f64;
-        let correction_1 = 1.0 - self.beta_1.powf(time);
-        let correction_2 = (1.0 - self.beta_2.powf(time)).sqrt();
-
-        // m / c1 / (sqrt(v) / c2 + eps) = (c2 / c1) m / (sqrt(v) + c2 eps)
-        let step = AdamStep {
-            beta_1: self.beta_1,
-            beta_2: self.beta_2,
-            rate: lr * correction_2 / correction_1,
-            epsilon: self.epsilon * correction_2,
-            rows: self.rows,
-        };
+        let step = self.step_at(lr, state.time);
         let moments = [state.moment_1, state.moment_2];
         let (tensor, [moment_1, moment_2]) = adam_step(tensor, grad, moments, &step).expect(
             "a gradient has the shape of its parameter, and so have the moments made from it",

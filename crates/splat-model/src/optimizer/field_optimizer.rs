@@ -1,5 +1,7 @@
 //! The optimiser of one field, with the state that it owns.
 
+use std::any::Any;
+
 use burn::optim::{RecordState, StateSink, StateSource};
 use burn::tensor::{Device, Tensor};
 
@@ -7,7 +9,7 @@ use super::edit::{MomentEdit, RowOptimizer};
 use super::state_record::StateRecord;
 
 /// Steps one field and edits its moments: a type-erased [`RowOptimizer`] with its state.
-pub struct FieldOptimizer(Box<dyn Erased>);
+pub struct FieldOptimizer(pub(super) Box<dyn Erased>);
 
 impl core::fmt::Debug for FieldOptimizer {
     fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
@@ -54,7 +56,10 @@ impl FieldOptimizer {
     }
 }
 
-trait Erased: Send {
+pub(super) trait Erased: Send {
+    /// For those that know a kind of optimiser more closely.
+    fn as_any(&self) -> &dyn Any;
+    fn as_any_mut(&mut self) -> &mut dyn Any;
     fn step(&mut self, rate: f64, value: Tensor<2>, gradient: Tensor<2>) -> Tensor<2>;
     fn edit_rows(&mut self, edit: &MomentEdit);
     fn save(&self) -> StateRecord;
@@ -66,12 +71,20 @@ trait Erased: Send {
     ) -> Result<(), String>;
 }
 
-struct Owner<O: RowOptimizer> {
-    optimizer: O,
-    state: Option<O::State<2>>,
+pub(super) struct Owner<O: RowOptimizer> {
+    pub(super) optimizer: O,
+    pub(super) state: Option<O::State<2>>,
 }
 
 impl<O: RowOptimizer> Erased for Owner<O> {
+    fn as_any(&self) -> &dyn Any {
+        self
+    }
+
+    fn as_any_mut(&mut self) -> &mut dyn Any {
+        self
+    }
+
     fn step(&mut self, rate: f64, value: Tensor<2>, gradient: Tensor<2>) -> Tensor<2> {
         let (value, state) = self
             .optimizer

@@ -8,6 +8,7 @@
 mod adam;
 mod edit;
 mod field_optimizer;
+mod groups;
 mod state_record;
 #[cfg(all(test, feature = "cpu"))]
 mod tests;

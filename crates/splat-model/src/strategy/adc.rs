@@ -3,13 +3,16 @@
 use burn::tensor::Device;
 use derive_setters::Setters;
 use serde::{Deserialize, Serialize};
-use splat_ops::OpError;
+use splat_ops::{OpError, RowGroups};
 use tracing::trace_span;
 
 use super::relocation::relocate_logit;
 use super::screen_sums::ScreenSums;
 use super::splats::Splats;
-use super::{Refinement, ScreenWants, StepContext, StepInfo, Strategy, check_fields, draw};
+use super::{
+    Refinement, RowsNeeded, ScreenView, ScreenWants, SparseStep, StepContext, StepInfo, Strategy,
+    check_fields, draw,
+};
 use crate::optimizer::StateRecord;
 use crate::rows::{Moments, RowEdit};
 use crate::{Field, SplatModel};
@@ -203,6 +206,20 @@ impl Adc {
         (edit, report)
     }
 
+    /// Adds what the views of a step say, of all rows or of some.
+    fn add(&mut self, screen: &[ScreenView], rows: Option<&RowGroups>) -> Result<(), OpError> {
+        let _span = trace_span!("density").entered();
+        let absgrad = self.settings.absgrad;
+        screen.iter().try_for_each(|view| {
+            let gradient = if absgrad {
+                &view.absgrad
+            } else {
+                &view.gradient
+            };
+            self.sums.add(view, gradient.as_ref(), rows)
+        })
+    }
+
     /// The rows that grow, in order. Where not all can, those do that need it most.
     fn growing(&self, splats: &Splats, gradients: &[f64]) -> Vec<usize> {
         let settings = &self.settings;
@@ -261,16 +278,25 @@ impl<M: SplatModel> Strategy<M> for Adc {
     }
 
     fn before_step(&mut self, context: &mut StepContext<M>) -> Result<(), OpError> {
-        let _span = trace_span!("density").entered();
-        let absgrad = self.settings.absgrad;
-        context.screen.iter().try_for_each(|view| {
-            let gradient = if absgrad {
-                &view.absgrad
-            } else {
-                &view.gradient
-            };
-            self.sums.add(view, gradient.as_ref())
-        })
+        self.add(context.screen, None)
+    }
+
+    fn sparse_step(&mut self, step: &mut SparseStep) -> Result<(), OpError> {
+        self.add(step.screen, Some(step.rows))
+    }
+
+    /// All where [`after_step`](Strategy::after_step) has something to do.
+    fn rows_needed(&self, at: &StepInfo) -> RowsNeeded {
+        let (done, stop) = (at.step + 1, at.run.milestone(self.settings.stop));
+        let every = |steps: usize| done.is_multiple_of(steps);
+        let due = match done > stop {
+            true => !self.sums.is_empty(),
+            false => every(self.settings.every) || every(self.settings.reset_every),
+        };
+        match due {
+            true => RowsNeeded::AllAfter,
+            false => RowsNeeded::Seen,
+        }
     }
 
     fn after_step(&mut self, context: &mut StepContext<M>) -> Result<Option<Refinement>, OpError> {

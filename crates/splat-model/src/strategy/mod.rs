@@ -14,6 +14,7 @@ mod relocation;
 mod schedule;
 mod scores;
 mod screen_sums;
+mod sparse_step;
 mod splats;
 #[cfg(all(test, feature = "cpu"))]
 mod tests;
@@ -33,6 +34,7 @@ pub use mcmc::{Mcmc, McmcSettings};
 pub use relocation::relocate;
 pub use schedule::{RunSchedule, StepInfo};
 pub use scores::weighted_contributions;
+pub use sparse_step::{RowsNeeded, SparseStep};
 
 /// Screen gradients that a strategy needs in a step.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -201,6 +203,23 @@ pub trait Strategy<M: SplatModel>: Send {
     /// Screen gradients needed at a step.
     fn screen_wants(&self, _at: &StepInfo) -> ScreenWants {
         ScreenWants::nothing()
+    }
+
+    /// Which rows it needs around a step. Where it does not need all, the step may be one of the
+    /// rows alone that its views may see, which calls [`sparse_step`](Self::sparse_step) in place
+    /// of [`before_step`](Self::before_step); a strategy that adds terms to the loss always has
+    /// all. Default: all.
+    fn rows_needed(&self, _at: &StepInfo) -> RowsNeeded {
+        RowsNeeded::All
+    }
+
+    /// Called in a step of some rows, after the backward pass and before the optimiser. Gradients
+    /// may be read and changed.
+    ///
+    /// # Errors
+    /// As those of the ops that it uses.
+    fn sparse_step(&mut self, _step: &mut SparseStep) -> Result<(), OpError> {
+        Ok(())
     }
 
     /// Names of the terms that [`loss_terms`](Self::loss_terms) adds to the loss.

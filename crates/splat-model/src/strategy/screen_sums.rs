@@ -2,7 +2,7 @@
 
 use burn::tensor::{Device, Tensor, TensorData};
 use splat_ops::device::to_host;
-use splat_ops::{OpError, ScreenStatistics};
+use splat_ops::{OpError, RowGroups, ScreenStatistics};
 
 use super::ScreenView;
 use crate::optimizer::StateRecord;
@@ -18,16 +18,19 @@ const VIEWS: &str = "views";
 
 impl ScreenSums {
     /// Adds a view, by the gradient of its screen splats `[C, N, 9]` or their absolute gradients
-    /// `[C, N, 2]`, whichever is given. Sums over another number of Gaussians are dropped.
+    /// `[C, N, 2]`, whichever is given; those of some rows alone, if these are named. Sums over
+    /// another number of Gaussians are dropped.
     pub(super) fn add(
         &mut self,
         view: &ScreenView,
         gradient: Option<&Tensor<3>>,
+        rows: Option<&RowGroups>,
     ) -> Result<(), OpError> {
         let Some(gradient) = gradient.cloned() else {
             return Ok(());
         };
-        let [_, n, _] = gradient.dims();
+        let [_, splats, _] = gradient.dims();
+        let n = rows.map_or(splats, RowGroups::count);
         let before = self.0.take().filter(|sums| sums.views.dims() == [n]);
         let before = before.unwrap_or_else(|| {
             let zeros = Tensor::zeros([n], (&gradient.device(), gradient.dtype()));
@@ -36,8 +39,15 @@ impl ScreenSums {
                 views: zeros,
             }
         });
-        self.0 = Some(before.add(gradient, &view.projected)?);
+        self.0 = Some(match rows {
+            None => before.add(gradient, &view.projected)?,
+            Some(rows) => before.add_rows(gradient, &view.projected, rows)?,
+        });
         Ok(())
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_none()
     }
 
     pub(super) fn clear(&mut self) {
@@ -120,7 +130,7 @@ mod tests {
                     gradient: None,
                     absgrad: None,
                 };
-                sums.add(&view, Some(&gradient)).unwrap();
+                sums.add(&view, Some(&gradient), None).unwrap();
             }
             let saved = sums.save().unwrap();
             let values = |name: &str| saved.tensors[name].try_to_vec::<f32>().unwrap();

@@ -8,9 +8,10 @@ use rayon::prelude::*;
 
 use super::buffer::{Buffer, BufferMut};
 use super::real::Real;
+use super::row_groups::chosen;
 use super::simd::vectorized;
 use crate::backend::{AdamInputs, AdamOps, AdamOutputs, AdamTensors, OpInputs};
-use crate::settings::{AdamRows, AdamStep};
+use crate::settings::{AdamGap, AdamRows, AdamStep, RowGroups};
 
 /// Approximate number of elements per unit of parallel work.
 const CHUNK: usize = 8192;
@@ -25,10 +26,45 @@ struct Numbers<T> {
     epsilon: T,
 }
 
+impl<T: Real> Numbers<T> {
+    fn of(step: &AdamStep) -> Self {
+        Self {
+            beta_1: T::of(step.beta_1),
+            beta_2: T::of(step.beta_2),
+            rest_1: T::of(1.0 - step.beta_1),
+            rest_2: T::of(1.0 - step.beta_2),
+            rate: T::of(step.rate),
+            epsilon: T::of(step.epsilon),
+        }
+    }
+}
+
 impl AdamOps for Flex {
     fn adam(OpInputs(inputs): AdamInputs<Self>, step: AdamStep) -> AdamOutputs<Self> {
         in_precision!(inputs.param, self::step, inputs, &step)
     }
+
+    fn adam_groups(
+        OpInputs(inputs): AdamInputs<Self>,
+        step: AdamStep,
+        rows: RowGroups,
+    ) -> AdamOutputs<Self> {
+        in_precision!(inputs.param, step_groups, inputs, &step, &rows)
+    }
+
+    fn adam_catch_up(
+        tensors: AdamOutputs<Self>,
+        rows: RowGroups,
+        gaps: Vec<AdamGap>,
+    ) -> AdamOutputs<Self> {
+        in_precision!(tensors.param, catch_up, tensors, &rows, &gaps)
+    }
+}
+
+/// Values of a row.
+fn width(param: &FlexTensor) -> usize {
+    let rows = param.shape()[0].max(1);
+    (param.shape().num_elements() / rows).max(1)
 }
 
 /// Writes parameter and moments into their own memory, unless something else holds that memory too.
@@ -43,16 +79,8 @@ fn step<T: Real>(
         moment_1,
         moment_2,
     } = inputs;
-    let numbers = Numbers {
-        beta_1: T::of(step.beta_1),
-        beta_2: T::of(step.beta_2),
-        rest_1: T::of(1.0 - step.beta_1),
-        rest_2: T::of(1.0 - step.beta_2),
-        rate: T::of(step.rate),
-        epsilon: T::of(step.epsilon),
-    };
-    let rows = param.shape()[0].max(1);
-    let width = (param.shape().num_elements() / rows).max(1);
+    let numbers = Numbers::of(step);
+    let width = width(&param);
     let chunk = CHUNK.next_multiple_of(width);
 
     let grad = Buffer::new(grad);
@@ -63,27 +91,136 @@ fn step<T: Real>(
         .zip(moment_1.par_chunks_mut(chunk))
         .zip(moment_2.par_chunks_mut(chunk))
         .zip(grad.slice::<T>().par_chunks(chunk))
-        .for_each(|(((param, moment_1), moment_2), grad)| match step.rows {
-            AdamRows::All => update(param, moment_1, moment_2, grad, &numbers),
-            AdamRows::Seen => {
-                let rows = param
-                    .chunks_exact_mut(width)
-                    .zip(moment_1.chunks_exact_mut(width))
-                    .zip(moment_2.chunks_exact_mut(width))
-                    .zip(grad.chunks_exact(width));
-                for (((param, moment_1), moment_2), grad) in rows {
-                    // NaN counts as zero.
-                    if grad.iter().any(|g| g.abs() > T::ZERO) {
-                        update(param, moment_1, moment_2, grad, &numbers);
-                    }
-                }
-            }
+        .for_each(|(((param, moment_1), moment_2), grad)| {
+            rows(
+                step.rows,
+                width,
+                [param, moment_1, moment_2],
+                grad,
+                &numbers,
+            );
         });
+    outputs(stepped)
+}
+
+/// Steps whole rows: all, or those with a gradient.
+fn rows<T: Real>(
+    rows: AdamRows,
+    width: usize,
+    [param, moment_1, moment_2]: [&mut [T]; 3],
+    grad: &[T],
+    numbers: &Numbers<T>,
+) {
+    if rows == AdamRows::All {
+        return update(param, moment_1, moment_2, grad, numbers);
+    }
+    let rows = param
+        .chunks_exact_mut(width)
+        .zip(moment_1.chunks_exact_mut(width))
+        .zip(moment_2.chunks_exact_mut(width))
+        .zip(grad.chunks_exact(width));
+    for (((param, moment_1), moment_2), grad) in rows {
+        // NaN counts as zero.
+        if grad.iter().any(|g| g.abs() > T::ZERO) {
+            update(param, moment_1, moment_2, grad, numbers);
+        }
+    }
+}
+
+/// Parameter and moments of one group of rows.
+type Group<'a, T> = [&'a mut [T]; 3];
+
+/// The chosen groups of rows, in order.
+fn groups<'a, T: Real>(
+    buffers: &'a mut [BufferMut; 3],
+    width: usize,
+    rows: &RowGroups,
+) -> Vec<Group<'a, T>> {
+    let size = rows.size() * width;
+    let [param, moment_1, moment_2] = buffers.each_mut().map(|buffer| buffer.slice::<T>());
+    let groups = param
+        .chunks_mut(size)
+        .zip(moment_1.chunks_mut(size))
+        .zip(moment_2.chunks_mut(size));
+    chosen(
+        rows,
+        groups.map(|((param, moment_1), moment_2)| [param, moment_1, moment_2]),
+    )
+}
+
+fn step_groups<T: Real>(
+    _: PhantomData<T>,
+    inputs: AdamTensors<FlexTensor>,
+    step: &AdamStep,
+    rows: &RowGroups,
+) -> AdamOutputs<Flex> {
+    let numbers = Numbers::of(step);
+    let width = width(&inputs.param);
+    let grad = Buffer::new(inputs.grad);
+    let mut stepped = [inputs.param, inputs.moment_1, inputs.moment_2].map(BufferMut::new);
+    let grads = grad.slice::<T>().par_chunks(rows.size() * width);
+    groups::<T>(&mut stepped, width, rows)
+        .into_par_iter()
+        .zip(grads)
+        .for_each(|(group, grad)| self::rows(step.rows, width, group, grad, &numbers));
+    outputs(stepped)
+}
+
+fn catch_up<T: Real>(
+    _: PhantomData<T>,
+    tensors: AdamOutputs<Flex>,
+    rows: &RowGroups,
+    gaps: &[AdamGap],
+) -> AdamOutputs<Flex> {
+    let width = width(&tensors.param);
+    let mut caught = [tensors.param, tensors.moment_1, tensors.moment_2].map(BufferMut::new);
+    groups::<T>(&mut caught, width, rows)
+        .into_par_iter()
+        .zip(gaps)
+        .filter(|(_, gap)| **gap != AdamGap::NONE)
+        .for_each(|([param, moment_1, moment_2], gap)| {
+            let gap = Gap {
+                keep_1: T::of(gap.keep_1),
+                keep_2: T::of(gap.keep_2),
+                step: T::of(gap.step),
+                epsilon: T::of(gap.epsilon),
+            };
+            drift(param, moment_1, moment_2, &gap);
+        });
+    outputs(caught)
+}
+
+fn outputs(stepped: [BufferMut; 3]) -> AdamOutputs<Flex> {
     let [param, moment_1, moment_2] = stepped.map(BufferMut::into_tensor);
     AdamOutputs {
         param,
         moment_1,
         moment_2,
+    }
+}
+
+/// An [`AdamGap`] in the precision of the tensors.
+struct Gap<T> {
+    keep_1: T,
+    keep_2: T,
+    step: T,
+    epsilon: T,
+}
+
+vectorized! {
+    /// Does to a slice of elements what steps without a gradient do.
+    fn drift<T: Real, const FMA: bool>(
+        param: &mut [T],
+        moment_1: &mut [T],
+        moment_2: &mut [T],
+        gap: &Gap<T>,
+    ) {
+        let elements = param.iter_mut().zip(moment_1).zip(moment_2);
+        for ((param, moment_1), moment_2) in elements {
+            *param -= *moment_1 / (moment_2.sqrt() + gap.epsilon) * gap.step;
+            *moment_1 = *moment_1 * gap.keep_1;
+            *moment_2 = *moment_2 * gap.keep_2;
+        }
     }
 }
 

@@ -29,6 +29,7 @@ pub(crate) mod poison;
 mod project;
 mod rasterize;
 pub(crate) mod real;
+mod row_groups;
 mod schedule;
 mod screen_statistics;
 mod sh_colors;

@@ -8,10 +8,12 @@ use rayon::prelude::*;
 
 use super::buffer::BufferMut;
 use super::real::Real;
+use super::row_groups::chosen;
 use crate::backend::{
     OpInputs, PROJECTED_EXTENT, ScreenProbeOps, ScreenStatisticsInputs, ScreenStatisticsOps,
     ScreenStatisticsOutputs, ScreenStatisticsTensors,
 };
+use crate::settings::RowGroups;
 
 /// Gaussians per unit of parallel work, at least.
 const CHUNK: usize = 4096;
@@ -46,8 +48,9 @@ impl ScreenStatisticsOps for Flex {
     fn add_screen_statistics(
         OpInputs(inputs): ScreenStatisticsInputs<Self>,
         half: [f64; 2],
+        rows: Option<RowGroups>,
     ) -> ScreenStatisticsOutputs<Self> {
-        in_precision!(inputs.gradient, add, inputs, half)
+        in_precision!(inputs.gradient, add, inputs, half, rows)
     }
 }
 
@@ -55,6 +58,7 @@ fn add<T: Real>(
     _: PhantomData<T>,
     inputs: ScreenStatisticsTensors<FlexTensor>,
     half: [f64; 2],
+    rows: Option<RowGroups>,
 ) -> ScreenStatisticsOutputs<Flex> {
     let ScreenStatisticsTensors {
         gradient,
@@ -75,25 +79,37 @@ fn add<T: Real>(
     let [width, height] = half.map(T::of);
     let mut sums = [gradients, views].map(BufferMut::new);
     let [gradients, views] = sums.each_mut().map(|buffer| buffer.slice::<T>());
-    gradients
-        .par_iter_mut()
-        .zip(views)
-        .enumerate()
-        .with_min_len(CHUNK)
-        .for_each(|(n, (total, views))| {
-            let (mut sum, mut count) = (T::ZERO, T::ZERO);
-            for c in 0..cameras {
-                if packed.at(c, n, PROJECTED_EXTENT) > T::ZERO {
-                    let (x, y) = (gradient.at(c, n, 0) * width, gradient.at(c, n, 1) * height);
-                    let length = (x * x + y * y).sqrt();
-                    // One that is not finite must not hide the other views of the same Gaussian.
-                    sum += if length.is_finite() { length } else { T::ZERO };
-                    count += T::ONE;
-                }
+    let add = |n: usize, total: &mut T, views: &mut T| {
+        let (mut sum, mut count) = (T::ZERO, T::ZERO);
+        for c in 0..cameras {
+            if packed.at(c, n, PROJECTED_EXTENT) > T::ZERO {
+                let (x, y) = (gradient.at(c, n, 0) * width, gradient.at(c, n, 1) * height);
+                let length = (x * x + y * y).sqrt();
+                // One that is not finite must not hide the other views of the same Gaussian.
+                sum += if length.is_finite() { length } else { T::ZERO };
+                count += T::ONE;
             }
-            *total += sum;
-            *views += count;
-        });
+        }
+        *total += sum;
+        *views += count;
+    };
+    match rows {
+        None => gradients
+            .par_iter_mut()
+            .zip(views)
+            .enumerate()
+            .with_min_len(CHUNK)
+            .for_each(|(n, (total, views))| add(n, total, views)),
+        Some(rows) => {
+            let size = rows.size();
+            let of_groups = gradients.chunks_mut(size).zip(views.chunks_mut(size));
+            let parts = chosen(&rows, of_groups).into_par_iter().enumerate();
+            parts.for_each(|(part, (totals, views))| {
+                let sums = totals.iter_mut().zip(views).enumerate();
+                sums.for_each(|(row, (total, views))| add(part * size + row, total, views));
+            });
+        }
+    }
     let [gradients, views] = sums.map(BufferMut::into_tensor);
     ScreenStatisticsOutputs { gradients, views }
 }

@@ -8,6 +8,7 @@ use crate::backend::{
     OpInputs, ScreenProbeOps, ScreenStatisticsInputs, ScreenStatisticsOps, ScreenStatisticsOutputs,
     ScreenStatisticsTensors,
 };
+use crate::settings::RowGroups;
 
 impl ScreenProbeOps for CubeBackend {}
 
@@ -15,6 +16,7 @@ impl ScreenStatisticsOps for CubeBackend {
     fn add_screen_statistics(
         OpInputs(inputs): ScreenStatisticsInputs<Self>,
         half: [f64; 2],
+        rows: Option<RowGroups>,
     ) -> ScreenStatisticsOutputs<Self> {
         let ScreenStatisticsTensors {
             gradient,
@@ -29,6 +31,7 @@ impl ScreenStatisticsOps for CubeBackend {
             [&buffer(&gradient), &buffer(&packed)],
             [gradients, views],
             half.map(|half| half as f32),
+            rows.as_ref(),
         );
         ScreenStatisticsOutputs {
             gradients: gradients_tensor(gradients),

@@ -127,7 +127,7 @@ impl Checkpoint {
                 step: state.step,
                 run: run.clone(),
                 elapsed_seconds: state.elapsed.as_secs_f64(),
-                origin_bits: state.model.model().origin().map(f64::to_bits),
+                origin_bits: state.model.origin().map(f64::to_bits),
                 strategy: state.strategy.name(),
                 hooks: state
                     .hooks
@@ -135,7 +135,7 @@ impl Checkpoint {
                     .iter()
                     .map(|hook| hook.name().to_owned())
                     .collect(),
-                gaussians: state.model.model().count(),
+                gaussians: state.model.count(),
                 scalars: (record.scalars.into_iter())
                     .map(|(name, value)| (name, value.into()))
                     .collect(),

@@ -74,7 +74,7 @@ impl<M: SplatModel> Trainer<M> {
         (self.watch.on_progress)(Progress {
             step,
             steps,
-            gaussians: self.state.model.model().count(),
+            gaussians: self.state.model.count(),
             elapsed: self.state.elapsed,
             history: &self.state.history,
         });

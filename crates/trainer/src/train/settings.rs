@@ -67,6 +67,10 @@ pub struct TrainSettings {
     /// capture where each view sees most of them it was no faster, and 0.06 dB worse (50 photos,
     /// 2,000 steps, mean of three seeds).
     pub seen_rows_only: bool,
+    /// A step whose views see at most this share of the Gaussians leaves out the others, see
+    /// [`SparseOptimized`](splat_model::SparseOptimized): with the result of a step of all, but for
+    /// rounding. 0 means never. Default 0, until it has been measured.
+    pub sparse_share: f64,
     /// Whether a run repeats bit for bit on a CubeCL device; false saves memory there, see
     /// [`RasterizeSettings::deterministic`]. On the CPU it always does. Default true.
     pub deterministic: bool,
@@ -133,6 +137,7 @@ impl Default for TrainSettings {
             background: None,
             ssim_weight: 0.2,
             seen_rows_only: false,
+            sparse_share: 0.0,
             deterministic: true,
             strategy: StrategyKind::default(),
             max_gaussians_share: 1.0,
@@ -370,6 +375,10 @@ impl TrainSettings {
             ("density.prune_opacity", self.density.prune_opacity),
             ("density.reset_opacity", self.density.reset_opacity),
         ];
+        if !(0.0..=1.0).contains(&self.sparse_share) {
+            let share = self.sparse_share;
+            return Err(format!("`sparse_share` must lie in [0, 1], it is {share}"));
+        }
         match shares.iter().find(|(_, value)| !(0.0..1.0).contains(value)) {
             Some((field, value)) => Err(format!("`{field}` must lie in [0, 1), it is {value}")),
             None => Ok(()),

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use splat_model::optimizer::StateRecord;
 use splat_model::strategy::Strategy;
-use splat_model::{Optimized, SplatModel};
+use splat_model::{SparseOptimized, SplatModel};
 use splat_ops::OpError;
 
 use super::History;
@@ -12,7 +12,7 @@ use crate::hooks::Hooks;
 
 /// The model, its optimisers, the strategy and hooks, and how far the run got.
 pub(super) struct State<M: SplatModel> {
-    pub(super) model: Optimized<M>,
+    pub(super) model: SparseOptimized<M>,
     pub(super) strategy: Box<dyn Strategy<M>>,
     pub(super) hooks: Hooks,
     pub(super) history: History,
@@ -47,7 +47,7 @@ impl<M: SplatModel> State<M> {
         device: &burn::tensor::Device,
     ) -> Result<(), String> {
         self.model.restore(record.take_under(MODEL), device)?;
-        let rows = self.model.model().count();
+        let rows = self.model.count();
         let strategy = self
             .strategy
             .restore(record.take_under(STRATEGY), rows, device);

@@ -2,6 +2,7 @@
 
 mod calibration;
 mod extensions;
+mod sparse;
 mod strategies;
 
 use std::sync::atomic::{AtomicBool, Ordering};

@@ -1,15 +1,19 @@
 //! One training step: render, measure the loss, step the optimisers, let the strategy look at it
 //! all.
 
+use std::borrow::Cow;
 use std::sync::Arc;
 use std::time::Instant;
 
-use burn::tensor::{Device, Tensor};
-use splat_data::Capture;
-use splat_model::strategy::{Pass, RunSchedule, ScreenView, ScreenWants, StepContext, StepInfo};
+use burn::tensor::{Device, Gradients, Tensor};
+use splat_data::{Capture, View};
+use splat_model::strategy::{
+    Pass, RowsNeeded, RunSchedule, ScreenView, ScreenWants, SparseStep, StepContext, StepInfo,
+    Strategy,
+};
 use splat_model::{
-    CameraTensors, FieldGradients, Gaussians, RenderSettings, SceneScale, SplatModel,
-    project_gaussians, render_projected_on,
+    Camera, CameraTensors, Field, FieldGradients, FieldStep, Gaussians, Part, RenderSettings,
+    SceneScale, SplatModel, project_gaussians, render_projected_on,
 };
 use splat_ops::device::keep_awake;
 use splat_ops::{OpError, Projected, SH_DEGREE_MAX};
@@ -128,8 +132,9 @@ impl<M: SplatModel> Trainer<M> {
         self.schedule.scene_scale
     }
 
-    /// The model as it is after the last step.
-    pub fn model(&self) -> &M {
+    /// The model as it is after the last step; a copy where rows of it are behind, see
+    /// [`SparseOptimized`](splat_model::SparseOptimized).
+    pub fn model(&self) -> Cow<'_, M> {
         self.state.model.model()
     }
 
@@ -140,12 +145,22 @@ impl<M: SplatModel> Trainer<M> {
         };
         let wants = self.state.strategy.screen_wants(&at);
         let count = self.config.views_per_step;
-        let indices = (0..count).map(|i| self.views.at(at.step * count + i));
-        let indices: Vec<usize> = indices.collect();
-        let measured = indices
-            .into_iter()
-            .map(|index| self.measure(index, &at, wants))
+        let looks = (0..count)
+            .map(|i| self.look(at.step * count + i, &at))
             .collect::<Result<Vec<_>, _>>()?;
+        let part = self.part(&at, &looks)?;
+        let model = match &part {
+            Some(part) => Cow::Borrowed(part.model()),
+            None => {
+                self.state.model.whole();
+                self.state.model.model()
+            }
+        };
+        let measured = looks
+            .into_iter()
+            .map(|look| self.measure(look, &model, &at, wants))
+            .collect::<Result<Vec<_>, _>>()?;
+        drop(model);
         let (loss, unread, screen) = self.together(measured, &at)?;
         let mut gradients = trace_span!("backward").in_scope(|| loss.backward());
         let screen: Vec<ScreenView> = screen
@@ -167,25 +182,19 @@ impl<M: SplatModel> Trainer<M> {
                 }
             })
             .collect();
-        let mut fields = self.state.model.gradients(&mut gradients);
-        let edits = self.state.model.edits();
-        // From here on an error leaves a step half done, which is no state to go on from.
-        self.in_step = true;
-        self.strategy(&at, &mut fields, &screen, Moment::Before)?;
-        if self.state.model.edits() != edits {
-            return Err(TrainError::Setup(format!(
-                "the strategy {} edited rows in `before_step`, where gradients belong to the old ones; edit in `after_step`",
-                self.state.strategy.name()
-            )));
+        let needed = match part {
+            Some(_) => self.state.strategy.rows_needed(&at),
+            None => RowsNeeded::All,
+        };
+        let backward = Backward { gradients, screen };
+        match part {
+            Some(part) => self.step_part(part, backward, &at)?,
+            None => self.step_all(backward, &at)?,
         }
-        self.state.hooks.step(&mut gradients, &at)?;
-        // The optimisers need nothing of the picture.
-        drop((screen, gradients));
-        self.step_fields(fields, &at)?;
         self.losses.push(unread);
         self.state.step += 1;
         // Gaussians added after the last step would never be trained.
-        if self.state.step < self.config.steps {
+        if self.state.step < self.config.steps && needed != RowsNeeded::Seen {
             let done = StepInfo {
                 step: self.state.step,
                 ..at
@@ -196,30 +205,128 @@ impl<M: SplatModel> Trainer<M> {
         Ok(())
     }
 
-    /// Renders a training view and measures its loss.
-    fn measure(
+    /// Steps all rows.
+    fn step_all(&mut self, backward: Backward, at: &StepInfo) -> Result<(), TrainError> {
+        let Backward {
+            mut gradients,
+            screen,
+        } = backward;
+        let whole = self.state.model.whole();
+        let mut fields = whole.gradients(&mut gradients);
+        let edits = whole.edits();
+        // From here on an error leaves a step half done, which is no state to go on from.
+        self.in_step = true;
+        self.strategy(at, &mut fields, &screen, Moment::Before)?;
+        if self.state.model.whole().edits() != edits {
+            return Err(TrainError::Setup(format!(
+                "the strategy {} edited rows in `before_step`, where gradients belong to the old ones; edit in `after_step`",
+                self.state.strategy.name()
+            )));
+        }
+        self.state.hooks.step(&mut gradients, at)?;
+        // The optimisers need nothing of the picture.
+        drop((screen, gradients));
+        let _optimizer = trace_span!("optimizer").entered();
+        let strategy = &self.state.strategy;
+        let how = |field: &Field| how(strategy.as_ref(), field, at);
+        Ok(self.state.model.step(fields, how)?)
+    }
+
+    /// Steps the rows of a part.
+    fn step_part(
         &mut self,
-        training_index: usize,
+        part: Part<M>,
+        backward: Backward,
         at: &StepInfo,
-        wants: ScreenWants,
-    ) -> Result<Measured, TrainError> {
+    ) -> Result<(), TrainError> {
+        let Backward {
+            mut gradients,
+            screen,
+        } = backward;
+        let mut fields = part.gradients(&self.state.model, &mut gradients);
+        // As above.
+        self.in_step = true;
+        self.state.strategy.sparse_step(&mut SparseStep {
+            at: *at,
+            rows: part.rows(),
+            gradients: &mut fields,
+            screen: &screen,
+        })?;
+        self.state.hooks.step(&mut gradients, at)?;
+        drop((screen, gradients));
+        let _optimizer = trace_span!("optimizer").entered();
+        let strategy = &self.state.strategy;
+        let how = |field: &Field| how(strategy.as_ref(), field, at);
+        Ok(self.state.model.step_part(part, fields, how)?)
+    }
+
+    /// The rows that the views of a step may see, if the step can be one of these alone and is
+    /// worth it.
+    fn part(&mut self, at: &StepInfo, looks: &[Look]) -> Result<Option<Part<M>>, TrainError> {
+        let (share, strategy) = (self.config.sparse_share, &self.state.strategy);
+        let steps = |field: &Field| matches!(strategy.field_step(at, field), FieldStep::Step(_));
+        if !(share > 0.0)
+            || strategy.rows_needed(at) == RowsNeeded::All
+            || !strategy.loss_term_names().is_empty()
+            || !self.state.model.fields().iter().all(steps)
+        {
+            return Ok(None);
+        }
+        let _span = trace_span!("seen rows").entered();
+        let mut cameras = Vec::with_capacity(looks.len());
+        for look in looks {
+            // Hooks may have moved it.
+            match self.state.hooks.0.is_empty() {
+                true => cameras.push(look.camera),
+                false => cameras.extend(look.cameras.to_cameras()?),
+            }
+        }
+        let settings = self.render_settings(at).project;
+        let model = &mut self.state.model;
+        let rows = model.seen(&cameras, &settings);
+        let most = share * model.count() as f64;
+        let rows = rows.filter(|rows| !rows.is_empty() && rows.len() as f64 <= most);
+        Ok(rows.map(|rows| model.part(rows)))
+    }
+
+    /// The training view whose turn is this one, counted over the whole run, and its camera.
+    fn look(&mut self, turn: usize, at: &StepInfo) -> Result<Look, TrainError> {
+        let training_index = self.views.at(turn);
         let index = self.capture.split.train[training_index];
         let factor = self.state.strategy.photo_factor(at);
         let spectrum = self.spectrum.as_ref();
         let factor =
             factor.unwrap_or_else(|| resolution_schedule::factor(&self.config, spectrum, at));
         let view = self.coarse.view(&self.capture, index, factor.max(1));
-        let view = view.loaded()?;
-        let model = self.state.model.model();
-        let hooks = &self.state.hooks;
-        let hook_view = HookView {
-            training_index: Some(training_index),
-            name: &view.name,
-            purpose: Purpose::Training,
-        };
-        let camera = view.camera().relative_to(model.origin());
+        let camera = view.camera().relative_to(self.state.model.origin());
         let cameras = CameraTensors::from_camera(&camera, &self.device);
-        let cameras = hooks.cameras(&hook_view, cameras)?;
+        let hook_view = hook_view(training_index, &view);
+        let cameras = self.state.hooks.cameras(&hook_view, cameras)?;
+        Ok(Look {
+            training_index,
+            view,
+            camera,
+            cameras,
+        })
+    }
+
+    /// Renders a training view and measures its loss.
+    fn measure(
+        &self,
+        look: Look,
+        model: &M,
+        at: &StepInfo,
+        wants: ScreenWants,
+    ) -> Result<Measured, TrainError> {
+        let Look {
+            training_index,
+            view,
+            cameras,
+            ..
+        } = look;
+        let view = view.loaded()?;
+        let hooks = &self.state.hooks;
+        let hook_view = hook_view(training_index, &view);
         let settings = self.render_settings(at);
 
         let render = trace_span!("render").entered();
@@ -322,7 +429,7 @@ impl<M: SplatModel> Trainer<M> {
         screen: &[ScreenView],
         moment: Moment,
     ) -> Result<(), OpError> {
-        let origin = self.state.model.model().origin();
+        let origin = self.state.model.origin();
         let device = self.device.clone();
         let views = CaptureViews {
             capture: &self.capture,
@@ -331,7 +438,7 @@ impl<M: SplatModel> Trainer<M> {
         };
         let mut context = StepContext {
             at: *at,
-            model: &mut self.state.model,
+            model: self.state.model.whole(),
             gradients,
             screen,
             settings: self
@@ -344,7 +451,7 @@ impl<M: SplatModel> Trainer<M> {
             Moment::After => {
                 let _density = trace_span!("density").entered();
                 let refined = self.state.strategy.after_step(&mut context)?.is_some();
-                let count = self.state.model.model().count();
+                let count = self.state.model.count();
                 let before = self.state.history.counts.last().map(|(_, count)| *count);
                 if refined || before != Some(count) {
                     self.state.history.counts.push((at.step, count));
@@ -352,15 +459,6 @@ impl<M: SplatModel> Trainer<M> {
                 Ok(())
             }
         }
-    }
-
-    fn step_fields(&mut self, gradients: FieldGradients, at: &StepInfo) -> Result<(), OpError> {
-        let _optimizer = trace_span!("optimizer").entered();
-        let strategy = &self.state.strategy;
-        self.state.model.step(gradients, |field| {
-            let rate = field.rate_at(at.step, at.run.steps, at.run.scene_scale);
-            (rate, strategy.field_step(at, field))
-        })
     }
 
     fn render_settings(&self, at: &StepInfo) -> RenderSettings {
@@ -387,6 +485,41 @@ impl<M: SplatModel> Trainer<M> {
         }
         Ok(())
     }
+}
+
+/// A training view of a step and its camera.
+struct Look {
+    /// Index of the view among those that are trained on.
+    training_index: usize,
+    view: View,
+    /// Relative to the model's origin.
+    camera: Camera,
+    /// The camera as hooks have it.
+    cameras: CameraTensors,
+}
+
+/// What a backward pass gives.
+struct Backward {
+    gradients: Gradients,
+    screen: Vec<ScreenView>,
+}
+
+fn hook_view(training_index: usize, view: &View) -> HookView<'_> {
+    HookView {
+        training_index: Some(training_index),
+        name: &view.name,
+        purpose: Purpose::Training,
+    }
+}
+
+/// The rate of a field at a step, and what the strategy makes of it.
+fn how<M: SplatModel>(
+    strategy: &dyn Strategy<M>,
+    field: &Field,
+    at: &StepInfo,
+) -> (f64, FieldStep) {
+    let rate = field.rate_at(at.step, at.run.steps, at.run.scene_scale);
+    (rate, strategy.field_step(at, field))
 }
 
 /// The loss of a step, its values to be logged, and of each view its index, its splats and the

@@ -13,7 +13,7 @@ use serde::{Deserialize, Serialize};
 use splat_ops::device::device_info;
 
 pub use fit::{MemoryFit, gaussians, pixels, steepest};
-pub use scene::{PhotoSize, synthetic_capture};
+pub use scene::{PhotoSize, partly_seen_capture, synthetic_capture};
 
 use super::device_step::{self, write_device};
 use super::step::{StageColumn, at_degree, run, work_on, write_stages};

@@ -91,14 +91,31 @@ impl FromStr for PhotoSize {
 /// pixel, about 13 for each sheet, does not depend on their total, until they become smaller than a
 /// pixel and the low-pass filter limits their size.
 pub fn synthetic_capture(gaussians: usize, size: PhotoSize) -> Capture {
+    capture(gaussians, size, MARGIN, [STEP; 2])
+}
+
+/// The same with larger sheets, of which each of the four cameras sees this share, and each another
+/// one where the share is small.
+pub fn partly_seen_capture(gaussians: usize, size: PhotoSize, share: f64) -> Capture {
+    let margin = share.clamp(1e-6, 1.0).sqrt().recip();
+    // The nearest sheet is the smallest.
+    let step = (0.45 * (margin - 1.0) * SHEETS[0]).max(STEP * share);
+    let aspect = f64::from(size.height) / f64::from(size.width);
+    capture(gaussians, size, margin, [step, step * aspect])
+}
+
+fn capture(gaussians: usize, size: PhotoSize, margin: f64, step: [f64; 2]) -> Capture {
     let PhotoSize { width, height } = size;
-    let views = (0..VIEWS).map(|index| view(index, width, height)).collect();
+    let aspect = f64::from(height) / f64::from(width);
+    let views = (0..VIEWS)
+        .map(|index| view(index, width, height, step))
+        .collect();
     let mut rng = Pcg64Mcg::seed_from_u64(4);
-    let half_height = MARGIN * f64::from(height) / (2.0 * f64::from(width));
+    let half_height = 0.5 * margin * aspect;
     let points = (0..gaussians)
         .map(|index| {
             let z = SHEETS[index % SHEETS.len()];
-            let x = rng.random_range(-0.5 * MARGIN..0.5 * MARGIN);
+            let x = rng.random_range(-0.5 * margin..0.5 * margin);
             let y = rng.random_range(-half_height..half_height);
             Point {
                 position: [x * z, y * z, z],
@@ -122,9 +139,9 @@ pub fn synthetic_capture(gaussians: usize, size: PhotoSize) -> Capture {
     }
 }
 
-fn view(index: usize, width: u32, height: u32) -> View {
+fn view(index: usize, width: u32, height: u32, step: [f64; 2]) -> View {
     let (w, h) = (f64::from(width), f64::from(height));
-    let side = |bit: usize| STEP * if index & bit == 0 { 1.0 } else { -1.0 };
+    let side = |bit: usize, step: f64| step * if index & bit == 0 { 1.0 } else { -1.0 };
     // Waves of a few dozen pixels, independent of the image size.
     let image = (0..height)
         .flat_map(|y| (0..width).map(move |x| (x, y)))
@@ -140,8 +157,8 @@ fn view(index: usize, width: u32, height: u32) -> View {
         height,
         intrinsics: [w, w, 0.5 * w, 0.5 * h],
         viewmat: [
-            [1.0, 0.0, 0.0, side(1)],
-            [0.0, 1.0, 0.0, side(2)],
+            [1.0, 0.0, 0.0, side(1, step[0])],
+            [0.0, 1.0, 0.0, side(2, step[1])],
             [0.0, 0.0, 1.0, 0.0],
             [0.0, 0.0, 0.0, 1.0],
         ],
@@ -201,6 +218,20 @@ mod tests {
             // The margin is a tenth of each side.
             let share = inside.count() as f64 / 1000.0;
             assert!((0.75..0.9).contains(&share), "{share}");
+        }
+        // Each sees its share of a larger scene.
+        for share in [0.05, 0.2, 1.0] {
+            let capture = partly_seen_capture(20_000, PhotoSize::of_pixels(3000), share);
+            for view in capture.train_views() {
+                let seen = capture.points.iter().filter(|point| {
+                    let Some(([x, y], _)) = view.project(point.position) else {
+                        return false;
+                    };
+                    (0.0..63.0).contains(&x) && (0.0..48.0).contains(&y)
+                });
+                let seen = seen.count() as f64 / 20_000.0;
+                assert!((0.85..1.15).contains(&(seen / share)), "{seen} of {share}");
+            }
         }
         // An empty scene is not an error.
         let nothing = synthetic_capture(0, PhotoSize::of_pixels(0));
