@@ -409,7 +409,8 @@ impl<M: SplatModel> Strategy<M> for ImprovedGs {
 
     fn before_step(&mut self, context: &mut StepContext<M>) -> Result<(), OpError> {
         let _span = trace_span!("density").entered();
-        (context.screen.iter()).try_for_each(|view| self.sums.add(view, view.absgrad.as_ref(), None))
+        (context.screen.iter())
+            .try_for_each(|view| self.sums.add(view, view.absgrad.as_ref(), None))
     }
 
     fn after_step(&mut self, context: &mut StepContext<M>) -> Result<Option<Refinement>, OpError> {

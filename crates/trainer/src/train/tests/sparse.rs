@@ -93,7 +93,7 @@ fn three_hundred_steps_of_seen_rows_are_as_good_as_of_all() {
         let (all, some) = (run(0.0, steps), run(1.0, steps));
         let difference = differences(&all.model(), &some.model());
         let moved = differences(&all.model(), &run(0.0, 0).model());
-        eprintln!("after {steps} steps {difference:.2e?} apart, having moved {moved:.2e?}");
+        eprintln!("after {steps} steps {difference:?} apart, having moved {moved:?}");
         for (difference, moved) in difference.iter().zip(moved) {
             assert!(difference / moved < most, "{difference} of {moved}");
         }
