@@ -105,3 +105,18 @@ fn cpu_only(global: &GlobalArgs) -> Result<(), Failure> {
         )),
     }
 }
+
+/// Runs this program with other arguments in a process of its own, and reads the JSON that it
+/// prints; or says why there is none.
+fn in_a_process<T: serde::de::DeserializeOwned>(arguments: &[&str]) -> Result<T, String> {
+    let program = std::env::current_exe().map_err(|error| error.to_string())?;
+    let output = std::process::Command::new(program).args(arguments).output();
+    let output = output.map_err(|error| error.to_string())?;
+    if !output.status.success() {
+        let said = String::from_utf8_lossy(&output.stderr);
+        let words: Vec<&str> = said.split_whitespace().collect();
+        // A process that runs out of memory leaves no message.
+        return Err(format!("{} {}", output.status, words.join(" ")));
+    }
+    serde_json::from_slice(&output.stdout).map_err(|error| error.to_string())
+}

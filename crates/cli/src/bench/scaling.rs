@@ -1,12 +1,11 @@
 //! `splat bench scaling`: growth of time and memory.
 
 use std::path::PathBuf;
-use std::process::Command;
 use std::time::Instant;
 
 use clap::Args;
 
-use super::{DeviceChoice, Failure, GlobalArgs, chosen, print, write_svg};
+use super::{DeviceChoice, Failure, GlobalArgs, chosen, in_a_process, print, write_svg};
 use crate::plots;
 use crate::report::metrics::write_json;
 use crate::report::{probe_files, probe_folder};
@@ -140,17 +139,8 @@ fn child(
         size,
         reason,
     };
-    let program = std::env::current_exe().map_err(|error| failed(error.to_string()))?;
-    let output = Command::new(program)
-        .args(["--device", device.argument(), "--quiet", "bench", "point"])
-        .args([gaussians.to_string(), size.to_string()])
-        .output()
-        .map_err(|error| failed(error.to_string()))?;
-    if !output.status.success() {
-        let said = String::from_utf8_lossy(&output.stderr);
-        let words: Vec<&str> = said.split_whitespace().collect();
-        // A process that runs out of memory leaves no message.
-        return Err(failed(format!("{} {}", output.status, words.join(" "))));
-    }
-    serde_json::from_slice(&output.stdout).map_err(|error| failed(error.to_string()))
+    let (gaussians, size) = (gaussians.to_string(), size.to_string());
+    let device = ["--device", device.argument()];
+    let point = ["--quiet", "bench", "point", &gaussians, &size];
+    in_a_process(&[&device[..], &point].concat()).map_err(failed)
 }

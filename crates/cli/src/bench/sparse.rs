@@ -1,12 +1,11 @@
 //! `splat bench sparse`: steps of the Gaussians that a view sees against steps of all.
 
 use std::path::PathBuf;
-use std::process::Command;
 use std::time::Instant;
 
 use clap::Args;
 
-use super::{Failure, GlobalArgs, cpu_only, print};
+use super::{Failure, GlobalArgs, cpu_only, in_a_process, print};
 use crate::report::metrics::write_json;
 use crate::report::probe_files;
 use splat_lab::performance::PerformanceError;
@@ -99,18 +98,13 @@ fn child(setup: &Setup) -> Result<Run, PerformanceError> {
         size: setup.size,
         reason,
     };
-    let program = std::env::current_exe().map_err(|error| failed(error.to_string()))?;
-    let output = Command::new(program)
-        .args(["--quiet", "bench", "sparse-run"])
-        .args([setup.gaussians.to_string(), setup.share.to_string()])
-        .args([setup.sparse_share.to_string(), setup.size.to_string()])
-        .output()
-        .map_err(|error| failed(error.to_string()))?;
-    if !output.status.success() {
-        let said = String::from_utf8_lossy(&output.stderr);
-        let words: Vec<&str> = said.split_whitespace().collect();
-        // A process that runs out of memory leaves no message.
-        return Err(failed(format!("{} {}", output.status, words.join(" "))));
-    }
-    serde_json::from_slice(&output.stdout).map_err(|error| failed(error.to_string()))
+    let arguments = [
+        setup.gaussians.to_string(),
+        setup.share.to_string(),
+        setup.sparse_share.to_string(),
+        setup.size.to_string(),
+    ];
+    let mut command = vec!["--quiet", "bench", "sparse-run"];
+    command.extend(arguments.iter().map(String::as_str));
+    in_a_process(&command).map_err(failed)
 }
