@@ -33,6 +33,8 @@ pub use part::Part;
 /// Rows of a group: small enough for tight boxes, large enough that testing all of them costs
 /// nothing.
 const GROUP: usize = 256;
+/// Most rows of a group.
+const LARGEST_GROUP: usize = 1 << 16;
 /// Steps of all rows by which boxes are widened before they are measured again.
 const MOST_WIDENED: usize = 16;
 /// Steps after which all rows catch up, so that the list of missed steps stays short.
@@ -121,13 +123,13 @@ impl<M: SplatModel> SparseOptimized<M> {
         }
     }
 
-    /// The same with groups of so many rows, at least one, instead of 256. Small groups have tight
+    /// The same with groups of so many rows, 1 to 65,536, instead of 256. Small groups have tight
     /// boxes, of which there are many.
     #[must_use]
     pub fn with_group_size(mut self, rows: usize) -> Self {
         self.catch_up_all();
         self.bounds = None;
-        self.group = rows.max(1);
+        self.group = rows.clamp(1, LARGEST_GROUP);
         self
     }
 

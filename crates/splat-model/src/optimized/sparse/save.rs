@@ -5,9 +5,9 @@ use burn::tensor::{Device, TensorData};
 use burn_pack::Scalar;
 use splat_ops::OpError;
 
-use super::SparseOptimized;
 use super::bounds::{Bounds, GroupBox};
 use super::missed::MissedSteps;
+use super::{LARGEST_GROUP, SparseOptimized};
 use crate::SplatModel;
 use crate::optimizer::StateRecord;
 
@@ -63,9 +63,13 @@ impl<M: SplatModel> SparseOptimized<M> {
         let mut sparse = record.take_under(SPARSE);
         self.behind.restore(record, device)?;
         // Older checkpoints know of none.
-        self.group = take_number(&mut sparse, GROUP)?
-            .unwrap_or(self.group)
-            .max(1);
+        let group = take_number(&mut sparse, GROUP)?.unwrap_or(self.group);
+        if !(1..=LARGEST_GROUP).contains(&group) {
+            return Err(format!(
+                "`{GROUP}` must be 1 to {LARGEST_GROUP}, it is {group}"
+            ));
+        }
+        self.group = group;
         let groups = self.count().div_ceil(self.group);
         let steps = take_number(&mut sparse, STEPS)?.unwrap_or(0);
         self.missed = MissedSteps::restore(sparse.take_under(MISSED), steps)?;

@@ -432,3 +432,16 @@ fn a_part_of_other_rows_is_refused() {
     let message = refused(&mut model, part, gradients, step);
     assert!(message.contains("other rows"), "{message}");
 }
+
+#[test]
+fn a_checkpoint_with_groups_of_no_size_is_refused() {
+    let mut rng = Pcg64Mcg::seed_from_u64(10);
+    let mut model = model(&splats(100, &mut rng));
+    for size in [0, u64::MAX] {
+        let mut record = model.save().unwrap();
+        let group = burn_pack::Scalar::UInt(size);
+        record.scalars.insert("sparse/rows.group".to_owned(), group);
+        let message = model.restore(record, &Device::flex()).unwrap_err();
+        assert!(message.contains("`group`"), "{message}");
+    }
+}
