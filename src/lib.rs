@@ -53,6 +53,7 @@
 //! | [`Optimized`](model::Optimized) | a model with the optimisers of its fields |
 //! | [`RowEdit`](model::RowEdit) | an edit of the rows of a model, moments included |
 //! | [`Strategy`](model::strategy::Strategy) | the trait of density control; [`Adc`](model::strategy::Adc), [`Mcmc`](model::strategy::Mcmc), [`ImprovedGs`](model::strategy::ImprovedGs) |
+//! | [`reduce_sh_degrees`](model::reduce_sh_degrees) | lower degrees of spherical harmonics for Gaussians whose colours hardly depend on the view |
 //! | [`losses`](model::losses) | L1, MSE, PSNR and SSIM on tensors |
 //! | [`Capture`](data::Capture), [`Camera`](data::Camera) | photos with their cameras and points |
 //! | [`SplatData`](data::SplatData), [`scene`](data::scene) | a scene as plain arrays, and its files |

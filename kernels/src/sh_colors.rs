@@ -7,6 +7,10 @@
 //! where they are used. Gradients of Gaussians are summed over cameras inside one unit; those of
 //! the centres over blocks of Gaussians and then over the blocks, in order and without atomics.
 //!
+//! Where Gaussians have different degrees, the rows of their coefficients are given by starts. The
+//! loops are those of the highest degree; what a Gaussian does not have is neither read nor
+//! written, and counts as zero, bit for bit.
+//!
 //! If the packed splats are given, Gaussians culled by a camera are not evaluated: they are black
 //! and pass no gradient.
 //!
@@ -21,7 +25,9 @@ mod backward;
 
 use cubecl::ir::ElemType;
 use cubecl::prelude::*;
-use splat_core::{PROJECTED_EXTENT, PROJECTED_WIDTH, ShColorSettings, sh_coefficient_count};
+use splat_core::{
+    PROJECTED_EXTENT, PROJECTED_WIDTH, SH_DEGREE_MAX, ShColorSettings, sh_coefficient_count,
+};
 
 pub use self::backward::sh_colors_backward;
 use crate::bytes::{Bytes, Sizes};
@@ -45,7 +51,8 @@ pub(crate) fn floor(sizes: &Sizes) -> [Bytes; 2] {
     ]
 }
 
-/// Coefficients of the higher degrees [N, R, 3], as stored. Sums are in single precision.
+/// Coefficients of the higher degrees [N, R, 3], or [K, 1, 3] with starts, as stored. Sums are in
+/// single precision.
 #[derive(Clone, Debug)]
 pub enum ShRest {
     /// In single precision.
@@ -68,10 +75,14 @@ impl ShRest {
 pub struct ShColorInputs {
     /// Coefficients of degree 0 [N, 1, 3].
     pub sh0: Buffer,
-    /// Coefficients of the higher degrees [N, R, 3], if any.
+    /// Coefficients of the higher degrees [N, R, 3], or [K, 1, 3] with starts, if any.
     pub sh_rest: Option<ShRest>,
-    /// R.
+    /// R; not read with starts.
     pub stored: usize,
+    /// First row of the coefficients of each Gaussian, and the end K, [N + 1], if each has those of
+    /// its own degree. Whoever gives them has checked that they ascend by 0, 3, 8 or 15 from 0 to
+    /// K.
+    pub starts: Option<Buffer>,
     /// World positions [N, 3].
     pub means: Buffer,
     /// Camera centres [C, 3].
@@ -82,10 +93,18 @@ pub struct ShColorInputs {
 
 impl ShColorInputs {
     fn gaussians(&self) -> usize {
-        let rest = self.sh_rest.as_ref().filter(|_| self.stored > 0);
-        (self.means.len() / 3)
-            .min(self.sh0.len() / 3)
-            .min(rest.map_or(usize::MAX, |rest| rest.len() / (3 * self.stored)))
+        let count = (self.means.len() / 3).min(self.sh0.len() / 3);
+        match (&self.sh_rest, &self.starts) {
+            (Some(_), Some(starts)) => count.min(starts.len().saturating_sub(1)),
+            (Some(rest), None) if self.stored > 0 => count.min(rest.len() / (3 * self.stored)),
+            _ => count,
+        }
+    }
+
+    /// The starts, if there are any.
+    fn starts(&self) -> Option<BufferArg> {
+        let starts = self.starts.as_ref().filter(|_| self.sh_rest.is_some());
+        starts.map(Buffer::arg)
     }
 
     fn cameras(&self) -> usize {
@@ -93,7 +112,12 @@ impl ShColorInputs {
     }
 
     fn degree(&self, degree: usize) -> usize {
-        let stored = self.sh_rest.as_ref().map_or(0, |_| self.stored);
+        let stored = match (&self.sh_rest, &self.starts) {
+            (None, _) => 0,
+            (Some(_), None) => self.stored,
+            // Each Gaussian has its own.
+            (Some(_), Some(_)) => sh_coefficient_count(SH_DEGREE_MAX) - 1,
+        };
         usable_degree(degree, 1 + stored)
     }
 
@@ -133,6 +157,30 @@ fn sight(means: &[f32], centers: &[f32], gaussian: usize, camera: usize) -> Sigh
     }
 }
 
+/// Coefficients of a Gaussian beyond degree 0: where the first number is, and how many there are.
+#[derive(CubeType, Clone, Copy)]
+#[expand(derive(Clone, Copy))]
+struct Own {
+    from: usize,
+    count: usize,
+}
+
+/// The coefficients of a Gaussian: `stored` of each, or those that the starts give it.
+#[cube]
+fn own(starts: &ComptimeOption<&[u32]>, gaussian: usize, stored: usize) -> Own {
+    let mut from = gaussian * stored;
+    let mut count = stored;
+    #[comptime]
+    if let ComptimeOption::Some(starts) = starts {
+        from = starts[gaussian] as usize;
+        count = starts[gaussian + 1] as usize - from;
+    }
+    Own {
+        from: from * 3,
+        count,
+    }
+}
+
 #[cube]
 fn coefficient<R: Float>(rest: &[R], at: usize) -> Vec3 {
     Vec3::new(
@@ -140,6 +188,26 @@ fn coefficient<R: Float>(rest: &[R], at: usize) -> Vec3 {
         f32::cast_from(rest[at + 1]),
         f32::cast_from(rest[at + 2]),
     )
+}
+
+/// The coefficient of function k > 0; zero, and not read, if it is beyond those that a Gaussian has
+/// of its own.
+#[cube]
+fn own_coefficient<R: Float>(rest: &[R], own: Own, k: usize, #[comptime] ragged: bool) -> Vec3 {
+    if comptime!(ragged) {
+        let mut red = 0.0f32;
+        let mut green = 0.0f32;
+        let mut blue = 0.0f32;
+        if k <= own.count {
+            let found = coefficient::<R>(rest, own.from + (k - 1) * 3);
+            red = found.x;
+            green = found.y;
+            blue = found.z;
+        }
+        Vec3::new(red, green, blue)
+    } else {
+        coefficient::<R>(rest, own.from + (k - 1) * 3)
+    }
 }
 
 /// True if a camera sees a Gaussian, or if visibility is not asked for.
@@ -160,17 +228,17 @@ fn unclamped<R: Float>(
     rest: &[R],
     y: &Array<f32>,
     gaussian: usize,
-    stored: usize,
+    own: Own,
     #[comptime] degree: usize,
+    #[comptime] ragged: bool,
 ) -> Vec3 {
     let first = Vec3::load(sh0, gaussian * 3).scale(y[0]);
     let mut red = first.x;
     let mut green = first.y;
     let mut blue = first.z;
-    let from = gaussian * stored * 3;
     #[unroll]
     for k in 1..comptime!(sh_coefficient_count(degree)) {
-        let coefficient = coefficient::<R>(rest, from + (k - 1) * 3);
+        let coefficient = own_coefficient::<R>(rest, own, k, ragged);
         red = fma(y[k], coefficient.x, red);
         green = fma(y[k], coefficient.y, green);
         blue = fma(y[k], coefficient.z, blue);
@@ -191,12 +259,14 @@ fn sh_colors_forward<R: Float>(
     means: &[f32],
     centers: &[f32],
     packed: &[f32],
+    starts: ComptimeOption<&[u32]>,
     colors: &mut [f32],
     gaussians: u32,
     cameras: u32,
     stored: u32,
     #[comptime] degree: usize,
     #[comptime] asked: bool,
+    #[comptime] ragged: bool,
     #[define(R)] _stored_as: ElemType,
 ) {
     let gaussians = gaussians as usize;
@@ -207,7 +277,8 @@ fn sh_colors_forward<R: Float>(
             let sight = sight(means, centers, gaussian, index / gaussians);
             let mut y = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
             basis(sight.unit, &mut y, degree);
-            let color = unclamped::<R>(sh0, rest, &y, gaussian, stored as usize, degree);
+            let own = own(&starts, gaussian, stored as usize);
+            let color = unclamped::<R>(sh0, rest, &y, gaussian, own, degree, ragged);
             Vec3::new(clamped(color.x), clamped(color.y), clamped(color.z))
                 .store(colors, index * 3);
         } else {
@@ -223,6 +294,8 @@ pub fn sh_colors(client: &Client, inputs: &ShColorInputs, settings: ShColorSetti
     let colors = Buffer::empty(client, cameras * gaussians * 3);
     let (rest, stored_as) = inputs.rest();
     let (packed, asked) = inputs.seen();
+    let starts = inputs.starts();
+    let ragged = starts.is_some();
     if let Some((count, dim)) = per_element(cameras * gaussians) {
         sh_colors_forward::launch(
             client,
@@ -233,12 +306,14 @@ pub fn sh_colors(client: &Client, inputs: &ShColorInputs, settings: ShColorSetti
             inputs.means.arg(),
             inputs.centers.arg(),
             packed,
+            starts.into(),
             colors.arg(),
             gaussians as u32,
             cameras as u32,
             inputs.stored as u32,
             inputs.degree(settings.degree),
             asked,
+            ragged,
             stored_as,
         );
     }

@@ -331,6 +331,9 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         }
     }
     saved?;
+    if let Some(reduced) = &trained.history.sh_reduction {
+        print(&format!("spherical harmonics {reduced}\n"))?;
+    }
     print(&format!(
         "{} Gaussians after {} steps in {:.1} s, in {}\n",
         trained.model.len(),

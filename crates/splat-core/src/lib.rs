@@ -19,7 +19,7 @@ pub use settings::{
     ALPHA_MIN, Activation, AdamGap, AdamRows, AdamStep, ClampGradient, ImageSize, Perturbation,
     ProjectSettings, RasterizeSettings, ShColorSettings, SsimArgs,
 };
-pub use sh::{SH_C0, SH_C1, SH_C2, SH_C3, SH_DEGREE_MAX, sh_coefficient_count};
+pub use sh::{SH_C0, SH_C1, SH_C2, SH_C3, SH_DEGREE_MAX, sh_coefficient_count, sh_degree_of};
 pub use tensors::{
     AdamTensors, PerturbTensors, ProjectTensors, RasterizeTensors, ScreenStatisticsTensors,
     ShColorTensors, SphericalHarmonicsTensors, SsimTensors,

@@ -32,3 +32,29 @@ pub const SH_C3: [f64; 5] = [
 pub const fn sh_coefficient_count(degree: usize) -> usize {
     (degree + 1) * (degree + 1)
 }
+
+/// The degree that has so many basis functions beyond that of degree 0: 0, 3, 8 or 15. `None` for
+/// another number.
+pub const fn sh_degree_of(rest: usize) -> Option<usize> {
+    match rest {
+        0 => Some(0),
+        3 => Some(1),
+        8 => Some(2),
+        15 => Some(3),
+        _ => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn degrees_follow_from_their_numbers_of_coefficients() {
+        let found: [_; 17] = core::array::from_fn(sh_degree_of);
+        for degree in 0..=SH_DEGREE_MAX {
+            assert_eq!(found[sh_coefficient_count(degree) - 1], Some(degree));
+        }
+        assert_eq!(found.iter().flatten().count(), SH_DEGREE_MAX + 1);
+    }
+}

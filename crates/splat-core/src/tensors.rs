@@ -147,7 +147,8 @@ tensors! {
         /// Positions of the cameras `[C, 3]`.
         centers,
     } optional {
-        /// Coefficients of the higher degrees `[N, R, 3]`; absent at degree 0.
+        /// Coefficients of the higher degrees `[N, R, 3]`, or `[K, 1, 3]` where Gaussians have
+        /// different degrees; absent at degree 0.
         sh_rest,
         /// Packed splats `[C, N, 9]`, of which those without an extent have no colour. Never has a
         /// gradient.

@@ -5,6 +5,10 @@ use splat_data::SceneScale;
 /// The row set of most parameters: one row per Gaussian.
 pub const GAUSSIANS: usize = 0;
 
+/// The row set of the coefficients of spherical harmonics of [`Gaussians`](crate::Gaussians) of
+/// different degrees; a row is a coefficient of one function, of three channels.
+pub const SH_COEFFICIENTS: usize = 1;
+
 /// A trained parameter of a [`SplatModel`](crate::SplatModel).
 ///
 /// ```
@@ -25,8 +29,9 @@ pub struct Field {
     /// contains one.
     pub path: String,
     /// Row set of the first dimension, or `None` for a parameter without rows, which row edits
-    /// leave alone. [`GAUSSIANS`] is the set of all Gaussians; a model may have others, with fewer
-    /// rows.
+    /// leave alone. [`GAUSSIANS`] is the set of all Gaussians; a model may have others, with as
+    /// many rows as it likes. Those of some may belong to the Gaussians, see
+    /// [`SplatModel::owned_rows`](crate::SplatModel::owned_rows).
     pub row_set: Option<usize>,
     /// Learning rate at the first step.
     pub rate: f64,

@@ -4,8 +4,8 @@ use burn::module::{Module, Param};
 use burn::tensor::{DType, Device, Tensor, TensorData};
 use splat_ops::device::reads_half;
 use splat_ops::{
-    OpError, Projected, SH_DEGREE_MAX, ShColorSettings, exp, sh_coefficient_count, sh_colors,
-    sigmoid,
+    OpError, Projected, SH_DEGREE_MAX, ShColorSettings, ShRest, ShStarts, exp,
+    sh_coefficient_count, sh_colors, sigmoid,
 };
 
 use splat_data::{SceneSettings, SplatData};
@@ -51,8 +51,12 @@ pub struct Gaussians {
     /// Spherical harmonics of degree 0, `[N, 1, 3]`.
     pub sh0: Param<Tensor<3>>,
     /// Spherical harmonics of the higher degrees, `[N, (degree + 1)^2 - 1, 3]`; absent for degree
-    /// 0.
+    /// 0. Where Gaussians have different degrees, those of each Gaussian's own, `[K, 1, 3]`.
     pub sh_rest: Option<Param<Tensor<3>>>,
+    /// Which rows of `sh_rest` are whose, where Gaussians have different degrees; see
+    /// [`with_sh_degrees`](Self::with_sh_degrees).
+    #[module(skip)]
+    pub sh_starts: Option<ShStarts>,
 }
 
 /// Storage precision of the higher degrees of spherical harmonics, 45 of the 59 floats of a degree
@@ -105,11 +109,14 @@ impl Gaussians {
                     device,
                 ))
             }),
+            sh_starts: None,
         }
     }
 
     /// Reads the scene back from the device. Render settings are not part of the model:
-    /// [`SplatData::settings`] is empty.
+    /// [`SplatData::settings`] is empty. Where Gaussians have different degrees, the scene has the
+    /// highest that is in use, and zeros beyond that of a Gaussian, as files do;
+    /// [`SplatData::degree_of`] tells them.
     pub fn to_data(&self) -> SplatData {
         SplatData {
             origin: self.origin,
@@ -118,10 +125,7 @@ impl Gaussians {
             quats: rows(self.quats.val()),
             opacity_logits: host(self.opacity_logits.val()),
             sh0: rows(self.sh0.val().squeeze_dim(1)),
-            sh_rest: self
-                .sh_rest
-                .as_ref()
-                .map_or_else(Vec::new, |rest| host(rest.val())),
+            sh_rest: self.padded_sh_rest(),
             sh_degree: self.sh_degree(),
             settings: SceneSettings::default(),
         }
@@ -136,7 +140,8 @@ impl Gaussians {
         if let (ShPrecision::Half, Some(rest)) = (precision, &self.sh_rest) {
             let values = rest.val().set_require_grad(false);
             let fits = || values.clone().abs().max().into_scalar::<f32>() <= HALF_MAX;
-            if reads_half(&values.device()) && !self.is_empty() && fits() {
+            let is_empty = values.shape().num_elements() == 0;
+            if reads_half(&values.device()) && !is_empty && fits() {
                 self.sh_rest = Some(Param::initialized(rest.id, values.cast(DType::F16)));
             }
         }
@@ -161,8 +166,11 @@ impl Gaussians {
         self.len() == 0
     }
 
-    /// Highest degree of spherical harmonics that the coefficients can hold.
+    /// Highest degree of spherical harmonics that the coefficients of a Gaussian can hold.
     pub fn sh_degree(&self) -> usize {
+        if let Some(starts) = &self.sh_starts {
+            return starts.highest_degree();
+        }
         let count = 1 + self.sh_rest.as_ref().map_or(0, |rest| rest.val().dims()[1]);
         (0..=SH_DEGREE_MAX)
             .rev()
@@ -192,9 +200,17 @@ impl Gaussians {
         settings: impl Into<ShColorSettings>,
         seen: Option<&Projected>,
     ) -> Result<Tensor<3>, OpError> {
+        let sh_rest = self.sh_rest.as_ref().map(|rest| rest.val());
+        let sh_rest = match (sh_rest, &self.sh_starts) {
+            (Some(coefficients), Some(starts)) => ShRest::Ragged {
+                starts: starts.on(&coefficients.device()),
+                coefficients,
+            },
+            (rest, _) => rest.into(),
+        };
         sh_colors(
             self.sh0.val(),
-            self.sh_rest.as_ref().map(|rest| rest.val()),
+            sh_rest,
             self.means.val(),
             centers,
             settings,

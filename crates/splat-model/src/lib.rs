@@ -15,20 +15,23 @@ mod rates;
 mod record;
 mod render;
 mod rows;
+mod sh_degrees;
+mod sh_reduction;
 pub mod strategy;
 
 pub use camera::CameraTensors;
-pub use field::{Field, GAUSSIANS};
+pub use field::{Field, GAUSSIANS, SH_COEFFICIENTS};
 pub use gaussians::{Gaussians, ShPrecision};
 pub use init::{InitError, InitSettings, splats_from_points};
 pub use model::SplatModel;
-pub use optimized::{FieldGradients, FieldStep, Optimized, Part, SparseOptimized};
+pub use optimized::{FieldGradients, FieldStep, Optimized, OwnedRows, Part, SparseOptimized};
 pub use rates::LearningRates;
 pub use record::RecordError;
 pub use render::{
     RenderSettings, project_gaussians, render, render_projected, render_projected_on,
 };
 pub use rows::{Moments, RowEdit};
+pub use sh_reduction::{ShReductionSettings, reduce_sh_degrees};
 pub use splat_data::{Camera, CameraModel, Lens, SceneScale, SplatData};
 pub use splat_ops as ops;
 

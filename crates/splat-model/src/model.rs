@@ -4,10 +4,10 @@
 use burn::module::Module;
 use burn::tensor::Tensor;
 use splat_data::SplatData;
-use splat_ops::{OpError, Projected, ShColorSettings};
+use splat_ops::{OpError, Projected, ShColorSettings, ShStarts};
 
-use crate::field::Field;
-use crate::{CameraTensors, Gaussians, LearningRates, RenderSettings};
+use crate::field::{Field, SH_COEFFICIENTS};
+use crate::{CameraTensors, Gaussians, LearningRates, OwnedRows, RenderSettings};
 
 /// A splat model: a Burn module that can be projected and coloured, and lists its trained
 /// parameters.
@@ -109,6 +109,43 @@ pub trait SplatModel: Module + 'static {
     fn is_row_wise(&self) -> bool {
         false
     }
+
+    /// Rows of other row sets that belong to its Gaussians, one entry for each such set. They
+    /// follow every edit of the Gaussians, which then calls
+    /// [`set_owned_rows`](Self::set_owned_rows). Default none.
+    fn owned_rows(&self) -> Vec<OwnedRows> {
+        Vec::new()
+    }
+
+    /// Takes note of which rows of a set belong to which Gaussian, after the fields of both sets
+    /// got their new rows.
+    ///
+    /// # Errors
+    /// When the model has no such set, or another number of rows in it. An edit or a restored state
+    /// has set the fields by then, so that this is a fault of the model or a damaged record.
+    fn set_owned_rows(&mut self, rows: &OwnedRows) -> Result<(), OpError> {
+        no_such_set("SplatModel::set_owned_rows", rows)
+    }
+
+    /// Lets each Gaussian keep at most so many of its rows of a set, the first ones. A model may
+    /// have had them as one row per Gaussian of a field until then; from now on they are
+    /// [`owned_rows`](Self::owned_rows).
+    ///
+    /// # Errors
+    /// When the model has no such set, or another number of Gaussians. It is then unchanged.
+    fn keep_owned_rows(&mut self, most: &OwnedRows) -> Result<(), OpError> {
+        no_such_set("SplatModel::keep_owned_rows", most)
+    }
+}
+
+fn no_such_set(op: &'static str, rows: &OwnedRows) -> Result<(), OpError> {
+    Err(OpError::Argument {
+        op,
+        what: format!(
+            "no rows of a set {} belong to the Gaussians of this model",
+            rows.row_set()
+        ),
+    })
 }
 
 impl SplatModel for Gaussians {
@@ -156,7 +193,11 @@ impl SplatModel for Gaussians {
             Field::rows("sh0", rates.sh0),
         ];
         if self.sh_rest.is_some() {
-            fields.push(Field::rows("sh_rest", rates.sh_rest));
+            let field = Field::rows("sh_rest", rates.sh_rest);
+            fields.push(match &self.sh_starts {
+                None => field,
+                Some(_) => field.in_row_set(SH_COEFFICIENTS),
+            });
         }
         fields
     }
@@ -170,6 +211,23 @@ impl SplatModel for Gaussians {
     }
 
     fn is_row_wise(&self) -> bool {
-        true
+        self.sh_starts.is_none()
+    }
+
+    fn owned_rows(&self) -> Vec<OwnedRows> {
+        let starts = self.sh_starts.iter();
+        let rows = |starts: &ShStarts| {
+            let counts = starts.starts().windows(2).map(|pair| pair[1] - pair[0]);
+            OwnedRows::of_counts(SH_COEFFICIENTS, counts)
+        };
+        starts.map(rows).collect()
+    }
+
+    fn set_owned_rows(&mut self, rows: &OwnedRows) -> Result<(), OpError> {
+        Self::set_owned_rows(self, rows)
+    }
+
+    fn keep_owned_rows(&mut self, most: &OwnedRows) -> Result<(), OpError> {
+        Self::keep_owned_rows(self, most)
     }
 }

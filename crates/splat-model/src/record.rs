@@ -25,8 +25,9 @@ pub struct RecordError {
 
 impl Gaussians {
     /// Saves all parameters, in single precision, and the origin as a burnpack file, replacing an
-    /// old file atomically. Render settings are not included; a PLY file
-    /// ([`splat_data::scene::ply`]) has them.
+    /// old file atomically. Gaussians of different degrees of spherical harmonics are saved at the
+    /// highest of them, as [`to_data`](Self::to_data) gives them. Render settings are not included;
+    /// a PLY file ([`splat_data::scene::ply`]) has them.
     ///
     /// ```
     /// # use splat_model::{Gaussians, SplatData};

@@ -114,6 +114,17 @@ pub enum Target<B: Backend> {
     Values(FloatTensor<B>),
 }
 
+/// How the coefficients of [`ShColorInputs`] belong to the Gaussians, in the form that Burn's
+/// dispatch carries.
+#[derive(Debug, Clone, ExtensionType)]
+pub enum ShLayout<B: Backend> {
+    /// As many of each, `[N, R, 3]`.
+    Uniform,
+    /// Those of each Gaussian's own degree, `[K, 1, 3]`, at the rows that start here: `[N + 1]`, of
+    /// type I32, as [`ShStarts`](crate::ShStarts) has checked them.
+    Ragged(IntTensor<B>),
+}
+
 /// A parameter and its moments after a step, in the form that Burn's dispatch carries.
 #[derive(Debug, Clone, ExtensionType)]
 pub struct AdamOutputs<B: Backend> {
@@ -191,6 +202,7 @@ pub trait ShColorsOps: Backend {
     /// Colours `[C, N, 3]`. Higher coefficients are present exactly when the degree is above 0.
     fn sh_colors(
         #[extension_type] inputs: ShColorInputs<Self>,
+        #[extension_type] layout: ShLayout<Self>,
         settings: ShColorSettings,
     ) -> FloatTensor<Self>;
 }
@@ -200,6 +212,7 @@ pub trait ShColorsBackend: ShColorsOps {
     /// Gradients of the inputs, from the gradient `[C, N, 3]` of the colours.
     fn sh_colors_backward(
         inputs: ShColorInputs<Self>,
+        layout: ShLayout<Self>,
         grad_colors: FloatTensor<Self>,
         settings: ShColorSettings,
         needs_grad: ShColorTensors<bool>,

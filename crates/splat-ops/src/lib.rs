@@ -103,6 +103,7 @@ mod project;
 mod rasterize;
 mod screen_statistics;
 mod sh_colors;
+mod sh_starts;
 mod spherical_harmonics;
 mod ssim;
 #[cfg(all(test, feature = "cpu"))]
@@ -128,7 +129,10 @@ pub use settings::{
     Activation, AdamGap, AdamRows, AdamStep, CameraModel, ClampGradient, ImageSize, Perturbation,
     ProjectSettings, RasterizeSettings, RowGroups, ShColorSettings, SsimArgs,
 };
-pub use sh_colors::sh_colors;
-pub use spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count, spherical_harmonics};
+pub use sh_colors::{ShRest, sh_colors};
+pub use sh_starts::ShStarts;
+pub use spherical_harmonics::{
+    SH_DEGREE_MAX, sh_coefficient_count, sh_degree_of, spherical_harmonics,
+};
 pub use splat_core::{Lens, LensDomain};
 pub use ssim::ssim_map;

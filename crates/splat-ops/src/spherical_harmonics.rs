@@ -4,7 +4,7 @@ use burn::backend::Dispatch;
 use burn::tensor::Tensor;
 use tracing::trace_span;
 
-pub use splat_core::{SH_DEGREE_MAX, sh_coefficient_count};
+pub use splat_core::{SH_DEGREE_MAX, sh_coefficient_count, sh_degree_of};
 
 use crate::OpError;
 use crate::backend::{OpInputs, SphericalHarmonicsOps, SphericalHarmonicsTensors};

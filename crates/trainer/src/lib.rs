@@ -16,6 +16,6 @@ pub use photo::{mask, photo};
 pub use train::expected_checksum;
 pub use train::{
     Checkpoint, CheckpointError, Command, History, IntoLoss, LOSS_BATCH, LossRecord, LossTerms,
-    Progress, RECIPES, Recipe, Snapshot, StrategyKind, TargetView, TrainError, TrainSettings,
-    Trained, Trainer, TrainerBuilder, Warning, command_queue,
+    Progress, RECIPES, Recipe, ShReduced, Snapshot, StrategyKind, TargetView, TrainError,
+    TrainSettings, Trained, Trainer, TrainerBuilder, Warning, command_queue,
 };

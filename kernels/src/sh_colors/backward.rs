@@ -4,7 +4,7 @@ use cubecl::ir::ElemType;
 use cubecl::prelude::*;
 use splat_core::{ClampGradient, ShColorSettings, ShColorTensors, sh_coefficient_count};
 
-use super::{ShColorInputs, Sight, coefficient, is_seen, sight, unclamped};
+use super::{Own, ShColorInputs, Sight, is_seen, own, own_coefficient, sight, unclamped};
 use crate::launch::{Buffer, CUBE_UNITS, CUBE_UNITS_USIZE, cube_count, per_element};
 use crate::math::{Vec3, is_below_zero};
 use crate::reduce::{sum_blocks, sum_units};
@@ -42,17 +42,16 @@ fn sight_vjp<R: Float>(
     rest: &[R],
     sight: Sight,
     g: Vec3,
-    gaussian: usize,
-    stored: usize,
+    own: Own,
     #[comptime] degree: usize,
+    #[comptime] ragged: bool,
 ) -> Vec3 {
     let mut weights = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
     // The function of degree 0 does not depend on the direction.
     weights[0] = 0.0f32;
-    let from = gaussian * stored * 3;
     #[unroll]
     for k in 1..comptime!(sh_coefficient_count(degree)) {
-        weights[k] = guarded_dot(g, coefficient::<R>(rest, from + (k - 1) * 3));
+        weights[k] = guarded_dot(g, own_coefficient::<R>(rest, own, k, ragged));
     }
     direction_vjp(sight.unit, sight.inverse, &weights, degree)
 }
@@ -66,6 +65,7 @@ fn sh_colors_backward_gaussians<R: Float>(
     centers: &[f32],
     packed: &[f32],
     grad_colors: &[f32],
+    starts: ComptimeOption<&[u32]>,
     grad_sh0: &mut [f32],
     grad_rest: &mut [f32],
     grad_means: &mut [f32],
@@ -76,12 +76,13 @@ fn sh_colors_backward_gaussians<R: Float>(
     #[comptime] needs_grad: ShColorTensors<bool>,
     #[comptime] asked: bool,
     #[comptime] recovers: bool,
+    #[comptime] ragged: bool,
     #[define(R)] _stored_as: ElemType,
 ) {
     let gaussians = gaussians as usize;
-    let stored = stored as usize;
     let gaussian = ABSOLUTE_POS;
     if gaussian < gaussians {
+        let own = own(&starts, gaussian, stored as usize);
         let mut y = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
         let mut sums = Array::<f32>::new(comptime!(3 * sh_coefficient_count(degree)));
         #[unroll]
@@ -98,7 +99,7 @@ fn sh_colors_backward_gaussians<R: Float>(
             if g.max_abs() != 0.0f32 && is_seen(packed, index, asked) {
                 let sight = sight(means, centers, gaussian, camera);
                 basis(sight.unit, &mut y, degree);
-                let color = unclamped::<R>(sh0, rest, &y, gaussian, stored, degree);
+                let color = unclamped::<R>(sh0, rest, &y, gaussian, own, degree, ragged);
                 let g = passed_on(color, g, recovers);
                 if comptime!(needs_grad.sh0 || needs_grad.sh_rest) {
                     #[unroll]
@@ -109,7 +110,7 @@ fn sh_colors_backward_gaussians<R: Float>(
                     }
                 }
                 if comptime!(needs_grad.means) {
-                    let grad = sight_vjp::<R>(rest, sight, g, gaussian, stored, degree);
+                    let grad = sight_vjp::<R>(rest, sight, g, own, degree, ragged);
                     mean_x += grad.x;
                     mean_y += grad.y;
                     mean_z += grad.z;
@@ -120,13 +121,18 @@ fn sh_colors_backward_gaussians<R: Float>(
             Vec3::new(sums[0], sums[1], sums[2]).store(grad_sh0, gaussian * 3);
         }
         if comptime!(needs_grad.sh_rest) {
-            let to = gaussian * stored * 3;
             #[unroll]
             for k in 3..comptime!(3 * sh_coefficient_count(degree)) {
-                grad_rest[to + k - 3] = sums[k];
+                if comptime!(ragged) {
+                    if k / 3 <= own.count {
+                        grad_rest[own.from + k - 3] = sums[k];
+                    }
+                } else {
+                    grad_rest[own.from + k - 3] = sums[k];
+                }
             }
-            for k in comptime!(3 * sh_coefficient_count(degree) - 3)..stored * 3 {
-                grad_rest[to + k] = 0.0f32;
+            for k in comptime!(3 * sh_coefficient_count(degree) - 3)..own.count * 3 {
+                grad_rest[own.from + k] = 0.0f32;
             }
         }
         if comptime!(needs_grad.means) {
@@ -144,6 +150,7 @@ fn sh_colors_backward_centers<R: Float>(
     centers: &[f32],
     packed: &[f32],
     grad_colors: &[f32],
+    starts: ComptimeOption<&[u32]>,
     partials: &mut [f32],
     gaussians: u32,
     cameras: u32,
@@ -152,11 +159,11 @@ fn sh_colors_backward_centers<R: Float>(
     #[comptime] degree: usize,
     #[comptime] asked: bool,
     #[comptime] recovers: bool,
+    #[comptime] ragged: bool,
     #[define(R)] _stored_as: ElemType,
 ) {
     let mut shared = Shared::new_slice(CUBE_UNITS_USIZE);
     let gaussians = gaussians as usize;
-    let stored = stored as usize;
     let camera = CUBE_POS / blocks as usize;
     let block = CUBE_POS % blocks as usize;
     let mut x = 0.0f32;
@@ -170,12 +177,13 @@ fn sh_colors_backward_centers<R: Float>(
                 let g = Vec3::load(grad_colors, index * 3);
                 // As above: a broken, unseen splat must not reach the camera.
                 if g.max_abs() != 0.0f32 && is_seen(packed, index, asked) {
+                    let own = own(&starts, gaussian, stored as usize);
                     let sight = sight(means, centers, gaussian, camera);
                     let mut values = Array::<f32>::new(comptime!(sh_coefficient_count(degree)));
                     basis(sight.unit, &mut values, degree);
-                    let color = unclamped::<R>(sh0, rest, &values, gaussian, stored, degree);
+                    let color = unclamped::<R>(sh0, rest, &values, gaussian, own, degree, ragged);
                     let g = passed_on(color, g, recovers);
-                    let grad = sight_vjp::<R>(rest, sight, g, gaussian, stored, degree);
+                    let grad = sight_vjp::<R>(rest, sight, g, own, degree, ragged);
                     x -= grad.x;
                     y -= grad.y;
                     z -= grad.z;
@@ -191,8 +199,8 @@ fn sh_colors_backward_centers<R: Float>(
     }
 }
 
-/// Gradients of sh0 [N, 1, 3], `sh_rest` [N, R, 3], means [N, 3] and centres [C, 3], from that of
-/// the colours [C, N, 3]; only those that `needs_grad` names.
+/// Gradients of sh0 [N, 1, 3], `sh_rest` in its own shape, means [N, 3] and centres [C, 3], from
+/// that of the colours [C, N, 3]; only those that `needs_grad` names.
 pub fn sh_colors_backward(
     client: &Client,
     inputs: &ShColorInputs,
@@ -203,16 +211,22 @@ pub fn sh_colors_backward(
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
     let degree = inputs.degree(settings.degree);
     let recovers = settings.clamp_gradient == ClampGradient::Recovering;
+    let ragged = inputs.starts().is_some();
+    let rest_len = match &inputs.sh_rest {
+        Some(rest) if ragged => rest.len(),
+        _ => gaussians * inputs.stored * 3,
+    };
     // A gradient that is not needed still needs a buffer to bind.
     let reserve = |needed, len| Buffer::empty(client, if needed { len } else { 1 });
     let sh0 = reserve(needs_grad.sh0, gaussians * 3);
-    let sh_rest = reserve(needs_grad.sh_rest, gaussians * inputs.stored * 3);
+    let sh_rest = reserve(needs_grad.sh_rest, rest_len);
     let means = reserve(needs_grad.means, gaussians * 3);
     if (needs_grad.sh0 || needs_grad.sh_rest || needs_grad.means)
         && let Some((count, dim)) = per_element(gaussians)
     {
         let (rest, stored_as) = inputs.rest();
         let (packed, asked) = inputs.seen();
+        let starts = inputs.starts();
         sh_colors_backward_gaussians::launch(
             client,
             count,
@@ -223,6 +237,7 @@ pub fn sh_colors_backward(
             inputs.centers.arg(),
             packed,
             grad_colors.arg(),
+            starts.into(),
             sh0.arg(),
             sh_rest.arg(),
             means.arg(),
@@ -233,6 +248,7 @@ pub fn sh_colors_backward(
             needs_grad,
             asked,
             recovers,
+            ragged,
             stored_as,
         );
     }
@@ -242,6 +258,7 @@ pub fn sh_colors_backward(
         if !partials.is_empty() {
             let (rest, stored_as) = inputs.rest();
             let (packed, asked) = inputs.seen();
+            let starts = inputs.starts();
             sh_colors_backward_centers::launch(
                 client,
                 cube_count(cameras * blocks),
@@ -252,6 +269,7 @@ pub fn sh_colors_backward(
                 inputs.centers.arg(),
                 packed,
                 grad_colors.arg(),
+                starts.into(),
                 partials.arg(),
                 gaussians as u32,
                 cameras as u32,
@@ -260,6 +278,7 @@ pub fn sh_colors_backward(
                 degree,
                 asked,
                 recovers,
+                ragged,
                 stored_as,
             );
         }

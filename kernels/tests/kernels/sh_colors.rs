@@ -1,5 +1,6 @@
 //! Colours from half-precision coefficients equal those from the same coefficients in single
-//! precision, bit for bit.
+//! precision, and those of Gaussians of different degrees equal those with zeros in place, bit for
+//! bit.
 
 use cubecl::client::Client;
 use splat_core::ShColorTensors;
@@ -86,6 +87,7 @@ fn halves_are_read_as_the_numbers_they_stand_for() {
         sh0: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
         sh_rest: Some(ShRest::Exact(upload(&client, &values))),
         stored: 15,
+        starts: None,
         means: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
         centers: upload(&client, &uniform(&mut rng, cameras * 3, -1.0, 1.0)),
         seen: None,
@@ -103,5 +105,81 @@ fn halves_are_read_as_the_numbers_they_stand_for() {
             colors.count() > n,
             "degree {degree}: too few colours to compare"
         );
+    }
+}
+
+#[test]
+fn gaussians_of_different_degrees_are_as_with_zeros_in_place() {
+    let Some(client) = client() else { return };
+    let mut rng = rng(38);
+    let (n, cameras) = (701, 2);
+    // Halves, so that they are the same numbers in either precision.
+    let halves: Vec<u16> = (0..n * 45)
+        .map(|i| 0x3400 + (i * 37 % 1024) as u16)
+        .collect();
+    let mut values: Vec<f32> = halves.iter().map(|half| single(*half)).collect();
+    let (mut starts, mut own, mut own_halves) = (vec![0], Vec::new(), Vec::new());
+    for i in 0..n {
+        let count = [15, 0, 3, 8, 0][i % 5];
+        let (of_gaussian, kept) = (45 * i, 3 * count);
+        own.extend_from_slice(&values[of_gaussian..][..kept]);
+        own_halves.extend_from_slice(&halves[of_gaussian..][..kept]);
+        values[of_gaussian + kept..of_gaussian + 45].fill(0.0);
+        starts.push((own.len() / 3) as u32);
+    }
+    let uniform_inputs = ShColorInputs {
+        sh0: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
+        sh_rest: Some(ShRest::Exact(upload(&client, &values))),
+        stored: 15,
+        starts: None,
+        means: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
+        centers: upload(&client, &uniform(&mut rng, cameras * 3, -1.0, 1.0)),
+        seen: None,
+    };
+    let ragged = ShColorInputs {
+        sh_rest: Some(ShRest::Exact(upload(&client, &own))),
+        stored: 1,
+        starts: Some(Buffer::from_u32(&client, &starts)),
+        ..uniform_inputs.clone()
+    };
+    let mut all = vec![&ragged];
+    let half = reads_half(&client).then(|| {
+        let bytes: Vec<u8> = own_halves
+            .iter()
+            .flat_map(|half| half.to_le_bytes())
+            .collect();
+        let handle = client.create_from_slice(&bytes);
+        ShColorInputs {
+            sh_rest: Some(ShRest::Half(HalfBuffer::new(handle, own.len()).unwrap())),
+            ..ragged.clone()
+        }
+    });
+    all.extend(&half);
+    let grad = upload(&client, &uniform(&mut rng, cameras * n * 3, -1.0, 1.0));
+    let rest_only = ShColorTensors {
+        sh_rest: true,
+        ..Default::default()
+    };
+    for degree in 1..=3 {
+        let expected = bits(&client, &uniform_inputs, &grad, degree);
+        for inputs in &all {
+            assert!(
+                bits(&client, inputs, &grad, degree) == expected,
+                "degree {degree}"
+            );
+        }
+        let of_rest = |inputs: &ShColorInputs| {
+            let grads = sh_colors_backward(&client, inputs, &grad, degree.into(), rest_only);
+            grads.sh_rest.unwrap().read_f32(&client).unwrap()
+        };
+        let (found, padded) = (of_rest(&ragged), of_rest(&uniform_inputs));
+        assert_eq!(found.len(), own.len());
+        for (i, pair) in starts.windows(2).enumerate() {
+            let found = &found[3 * pair[0] as usize..3 * pair[1] as usize];
+            assert!(
+                found == &padded[45 * i..][..found.len()],
+                "degree {degree}: {i}"
+            );
+        }
     }
 }

@@ -1,68 +1,96 @@
 //! Row edits of values and moments.
 
+use std::collections::BTreeMap;
+
 use burn::module::Module;
 use burn::tensor::{Bool, Int, Tensor, TensorData};
 use splat_ops::OpError;
 
 use super::Optimized;
 use super::fields::change;
+use super::owned::{Gather, OwnedRows};
 use crate::field::{Field, GAUSSIANS};
 use crate::optimizer::MomentEdit;
-use crate::rows::{FieldChanges, Moments, RowEdit};
+use crate::rows::{FieldChanges, RowEdit};
 
 impl<M: Module> Optimized<M> {
     /// Edits the rows of every field of a row set, with their moments, by one gather per field on
-    /// the device. Parameters keep their ids.
+    /// the device. Rows of other sets that belong to the Gaussians
+    /// ([`OwnedRows`](crate::OwnedRows)) follow an edit of those. Parameters keep their ids.
     ///
     /// # Errors
     /// When the edit names an old row, a row set or a field that does not exist, has values of the
-    /// wrong width, or leaves no Gaussian. The model is then unchanged.
+    /// wrong width, leaves no Gaussian, or is of rows that follow the Gaussians. The model is then
+    /// unchanged.
     pub fn edit_rows(&mut self, edit: &RowEdit) -> Result<(), OpError> {
         self.check_edit(edit)?;
+        let owned = match edit.row_set() {
+            GAUSSIANS => self.owned_rows(),
+            _ => Vec::new(),
+        };
+        let owned: Vec<_> = owned.iter().map(|rows| rows.follow(edit)).collect();
+        for (_, after) in &owned {
+            if i32::try_from(after.rows()).is_err() {
+                return Err(wrong(format!(
+                    "the row set {} would have more than 2^31 - 1 rows",
+                    after.row_set()
+                )));
+            }
+        }
         self.edits += 1;
         self.version += 1;
-        let device = match self
-            .fields
-            .iter()
-            .find(|field| field.row_set == Some(edit.row_set()))
-        {
-            Some(field) => match self.field(&field.name) {
-                Some(value) => value.device(),
-                None => return Ok(()),
-            },
-            None => return Ok(()),
-        };
-        let n = edit.len();
-        let sources: Vec<i32> = edit.sources().iter().map(|row| *row as i32).collect();
-        let restarts: Vec<bool> = (edit.moments().iter())
-            .map(|moments| *moments == Moments::Restart)
-            .collect();
-        let moment_sources: Vec<i32> = (edit.moment_sources().iter())
-            .map(|row| *row as i32)
-            .collect();
-        let source = Tensor::<1, Int>::from_data(TensorData::new(sources.clone(), [n]), &device);
-        let restarts = Tensor::<1, Bool>::from_data(TensorData::new(restarts, [n]), &device);
-        let mut changes = edit.changes();
-        let edited: Vec<String> = self
-            .fields
-            .iter()
-            .filter(|field| field.row_set == Some(edit.row_set()))
+        self.gather(edit.row_set(), Gather::of(edit), edit.changes());
+        for (gather, after) in owned {
+            self.gather(after.row_set(), gather, BTreeMap::new());
+            if let (Some(owner), Some(model)) = (self.owner, &mut self.model) {
+                (owner.set)(model, &after)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Gathers the new rows of every field of a row set, with their moments, and then changes
+    /// values.
+    fn gather(
+        &mut self,
+        row_set: usize,
+        gather: Gather,
+        mut changes: BTreeMap<&str, FieldChanges>,
+    ) {
+        let in_set = |field: &&Field| field.row_set == Some(row_set);
+        let edited: Vec<String> = (self.fields.iter().filter(in_set))
             .map(|field| field.name.clone())
             .collect();
+        let first = edited.first().and_then(|name| self.field(name));
+        let Some(device) = first.map(|value| value.device()) else {
+            return;
+        };
+        let Gather {
+            sources,
+            moments,
+            restarts,
+        } = gather;
+        let n = sources.len();
+        let same = moments == sources;
+        let source = Tensor::<1, Int>::from_data(TensorData::new(sources, [n]), &device);
+        let restarts = Tensor::<1, Bool>::from_data(TensorData::new(restarts, [n]), &device);
         let names = self.names();
         change(&mut self.model, names, |name, value| {
             if !edited.iter().any(|field| field == name) {
                 return value;
             }
-            let value = value.select(0, source.clone());
+            let value = match n {
+                0 => Tensor::zeros([0, value.dims()[1]], (&device, value.dtype())),
+                _ => value.select(0, source.clone()),
+            };
             match changes.remove(name) {
                 Some(changes) => changed(value, changes),
                 None => value,
             }
         });
-        let source = match moment_sources == sources {
+        let source = match same {
             true => source,
-            false => Tensor::from_data(TensorData::new(moment_sources, [n]), &device),
+            false => Tensor::from_data(TensorData::new(moments, [n]), &device),
         };
         let moments = MomentEdit::Gather { source, restarts };
         for field in &edited {
@@ -73,17 +101,18 @@ impl<M: Module> Optimized<M> {
                 self.waiting.insert(field.clone(), moments.apply(waiting));
             }
         }
-        Ok(())
     }
 
     /// Checks every row and width of an edit before anything changes.
     fn check_edit(&self, edit: &RowEdit) -> Result<(), OpError> {
-        let wrong = |what: String| {
-            Err(OpError::Argument {
-                op: "Optimized::edit_rows",
-                what,
-            })
-        };
+        let wrong = |what: String| Err(wrong(what));
+        let owned = self.owned_rows();
+        if owned.iter().any(|rows| rows.row_set() == edit.row_set()) {
+            return wrong(format!(
+                "rows of the set {} belong to the Gaussians and follow them; edit those",
+                edit.row_set()
+            ));
+        }
         let shapes = self.shapes();
         let in_set = |field: &&Field| field.row_set == Some(edit.row_set());
         if !self.fields.iter().any(|field| in_set(&field)) {
@@ -91,6 +120,17 @@ impl<M: Module> Optimized<M> {
         }
         if edit.row_set() == GAUSSIANS && edit.is_empty() {
             return wrong("no Gaussian would be left, and nothing could grow back".to_owned());
+        }
+        for field in self.fields.iter().filter(in_set) {
+            let [rows, _] = shapes[&field.name];
+            let other = |owned: &&OwnedRows| owned.gaussians() != rows;
+            if let (GAUSSIANS, Some(owned)) = (edit.row_set(), owned.iter().find(other)) {
+                return wrong(format!(
+                    "rows of the set {} belong to {} Gaussians, there are {rows}",
+                    owned.row_set(),
+                    owned.gaussians()
+                ));
+            }
         }
         let sources = [
             ("is made from", edit.sources()),
@@ -123,6 +163,13 @@ impl<M: Module> Optimized<M> {
             }
         }
         Ok(())
+    }
+}
+
+fn wrong(what: String) -> OpError {
+    OpError::Argument {
+        op: "Optimized::edit_rows",
+        what,
     }
 }
 

@@ -170,21 +170,32 @@ impl<F: FnMut(&str, Tensor<2>) -> Tensor<2>> ModuleMapper for FieldMapper<F> {
             return param;
         };
         param.map(|value| {
-            let (requires_grad, tracked) = (value.is_require_grad(), value.device().is_autodiff());
-            let strategy = value.gradient_checkpointing_strategy();
-            let mut dims = value.dims();
-            let value = if tracked { value.inner() } else { value };
-            let value = (self.map)(name, flat(value));
-            dims[0] = value.dims()[0];
-            let value = value.reshape(dims);
-            if !tracked {
-                return value;
-            }
-            let mut value = Tensor::from_inner(value);
-            if let Some(strategy) = strategy {
-                value = value.with_gradient_checkpointing_strategy(strategy);
-            }
-            value.set_require_grad(requires_grad)
+            outside_graph(value, |value| {
+                let mut dims = value.dims();
+                let value = (self.map)(name, flat(value));
+                dims[0] = value.dims()[0];
+                value.reshape(dims)
+            })
         })
     }
+}
+
+/// Remakes the value of a parameter outside the autodiff graph; the result is a leaf of the graph
+/// where the value was one.
+pub(crate) fn outside_graph<const D: usize>(
+    value: Tensor<D>,
+    make: impl FnOnce(Tensor<D>) -> Tensor<D>,
+) -> Tensor<D> {
+    let (requires_grad, tracked) = (value.is_require_grad(), value.device().is_autodiff());
+    let strategy = value.gradient_checkpointing_strategy();
+    let value = if tracked { value.inner() } else { value };
+    let value = make(value);
+    if !tracked {
+        return value;
+    }
+    let mut value = Tensor::from_inner(value);
+    if let Some(strategy) = strategy {
+        value = value.with_gradient_checkpointing_strategy(strategy);
+    }
+    value.set_require_grad(requires_grad)
 }

@@ -2,6 +2,7 @@
 
 mod edit;
 mod fields;
+mod owned;
 mod save;
 mod sparse;
 #[cfg(all(test, feature = "cpu"))]
@@ -18,8 +19,10 @@ use crate::field::Field;
 use crate::opacity::logit;
 use crate::optimizer::{FieldOptimizer, MomentEdit, SplatAdam};
 use crate::{LearningRates, SplatModel};
-pub(crate) use fields::tracked_field;
 use fields::{FieldVisitor, GradientsOf, Paths, Untracked, ValuesOf, change};
+pub(crate) use fields::{outside_graph, tracked_field};
+pub use owned::OwnedRows;
+use owned::Owner;
 
 /// Gradients by field name, each `[N, width]`; dimensions beyond the first are flattened.
 pub type FieldGradients = BTreeMap<String, Tensor<2>>;
@@ -74,12 +77,15 @@ pub struct Optimized<M> {
     edits: usize,
     /// Number of times that values have changed.
     version: usize,
+    /// Asked for the rows that belong to the Gaussians; `None` for a module that is no model.
+    owner: Option<Owner<M>>,
 }
 
 pub use sparse::{Part, SparseOptimized};
 
 impl<M: Module> Optimized<M> {
-    /// A model with an optimiser for each of its fields.
+    /// A module with an optimiser for each of its fields; [`of_model`](Self::of_model) is for a
+    /// [`SplatModel`], and knows of rows that belong to its Gaussians.
     ///
     /// # Errors
     /// When the model has no parameter at a field's path, or two fields share a name.
@@ -98,8 +104,27 @@ impl<M: Module> Optimized<M> {
             waiting: FieldGradients::new(),
             edits: 0,
             version: 0,
+            owner: None,
         };
         trained.check_fields()?;
+        Ok(trained)
+    }
+
+    /// A model with an optimiser for each of its fields, whose rates are from `rates`.
+    ///
+    /// # Errors
+    /// Those of [`new`](Self::new).
+    pub fn of_model(
+        model: M,
+        rates: &LearningRates,
+        optimizer: impl Fn(&Field) -> FieldOptimizer,
+    ) -> Result<Self, OpError>
+    where
+        M: SplatModel,
+    {
+        let fields = model.fields(rates);
+        let mut trained = Self::new(model, fields, optimizer)?;
+        trained.owner = Some(Owner::new());
         Ok(trained)
     }
 
@@ -116,8 +141,7 @@ impl<M: Module> Optimized<M> {
     where
         M: SplatModel,
     {
-        let fields = model.fields(rates);
-        Self::new(model, fields, |field| {
+        Self::of_model(model, rates, |field| {
             SplatAdam::of_field(field, rows, scene).into()
         })
     }

@@ -8,6 +8,8 @@ use splat_ops::OpError;
 
 use super::Optimized;
 use super::fields::{FieldVisitor, ValuesOf, change};
+use super::owned::OwnedRows;
+use crate::field::GAUSSIANS;
 use crate::optimizer::StateRecord;
 
 /// Name of an accumulated gradient, beside the moments.
@@ -16,7 +18,8 @@ const WAITING: &str = "waiting_gradient";
 impl<M: Module> Optimized<M> {
     /// Values and optimiser states of all fields, on the host: value `means` is tensor `means`, a
     /// moment of it `means.moment_1`. Values are `[N, width]`. Parameters that are not fields are
-    /// included under `fixed/`.
+    /// included under `fixed/`, numbers of the rows of row set 1 that belong to each Gaussian as
+    /// `owned/1`.
     ///
     /// # Errors
     /// When the device fails.
@@ -29,6 +32,9 @@ impl<M: Module> Optimized<M> {
         ));
         for (name, value) in fixed {
             record.tensors.insert(name, value.into_data());
+        }
+        for rows in self.owned_rows() {
+            rows.save(&mut record);
         }
         let shapes = self.shapes();
         for field in &self.fields {
@@ -48,14 +54,25 @@ impl<M: Module> Optimized<M> {
         Ok(record)
     }
 
-    /// Restores the output of [`save`](Self::save), with any number of rows. Parameters keep their
-    /// ids.
+    /// Restores the output of [`save`](Self::save), with any number of rows, and with rows that
+    /// belong to the Gaussians where they were not yet kept as such. Parameters keep their ids.
     ///
     /// # Errors
     /// A mismatch with the model or its optimisers, naming the field. The model is then unchanged;
     /// optimisers may have been restored.
     pub fn restore(&mut self, record: StateRecord, device: &Device) -> Result<(), String> {
+        let before = (self.model.clone(), self.fields.clone());
+        let restored = self.restore_all(record, device);
+        if restored.is_err() {
+            (self.model, self.fields) = before;
+        }
+        restored
+    }
+
+    fn restore_all(&mut self, record: StateRecord, device: &Device) -> Result<(), String> {
         let mut fields = record.by_field();
+        let owned = OwnedRows::restore(&mut fields)?;
+        self.lay_out(&owned)?;
         let shapes = self.shapes();
         let mut values = BTreeMap::new();
         let mut rows_of_set = BTreeMap::new();
@@ -101,6 +118,18 @@ impl<M: Module> Optimized<M> {
         if let Some(name) = fields.keys().next() {
             return Err(format!("`{name}` is no field of the model"));
         }
+        for rows in &owned {
+            let sizes = [(GAUSSIANS, rows.gaussians()), (rows.row_set(), rows.rows())];
+            for (set, expected) in sizes {
+                let found = rows_of_set.get(&set);
+                if found.is_some_and(|found| *found != expected) {
+                    return Err(format!(
+                        "`owned/{}` is for {expected} rows of the set {set}, which has {found:?}",
+                        rows.row_set()
+                    ));
+                }
+            }
+        }
         self.version += 1;
         self.waiting = waiting_gradients;
         let names = self.names();
@@ -111,6 +140,33 @@ impl<M: Module> Optimized<M> {
         change(&mut self.model, names, |name, value| {
             fixed.remove(name).unwrap_or(value)
         });
+        for rows in &owned {
+            if let (Some(owner), Some(model)) = (self.owner, &mut self.model) {
+                (owner.set)(model, rows).map_err(|error| error.to_string())?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Gives the model the row sets of a record that belong to its Gaussians, empty where it had
+    /// none.
+    fn lay_out(&mut self, owned: &[OwnedRows]) -> Result<(), String> {
+        let own = self.owned_rows();
+        let missing = |own: &&OwnedRows| owned.iter().all(|rows| rows.row_set() != own.row_set());
+        if let Some(missing) = own.iter().find(missing) {
+            return Err(format!("`owned/{}` is missing", missing.row_set()));
+        }
+        for rows in owned {
+            if own.iter().any(|own| own.row_set() == rows.row_set()) {
+                continue;
+            }
+            let first = (self.fields.iter()).find(|field| field.row_set == Some(GAUSSIANS));
+            let first = first.and_then(|field| self.field(&field.name));
+            let count = first.map_or(0, |value| value.dims()[0]);
+            let none = OwnedRows::of_counts(rows.row_set(), vec![0; count]);
+            let kept = self.keep_owned_rows(&none);
+            kept.map_err(|error| format!("`owned/{}`: {error}", rows.row_set()))?;
+        }
         Ok(())
     }
 

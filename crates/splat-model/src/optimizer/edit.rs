@@ -16,14 +16,37 @@ pub enum MomentEdit {
         /// `[N_new]`.
         restarts: Tensor<1, Bool>,
     },
+    /// Rows are cut into parts of one width; row i continues the moments of part `source[i]`,
+    /// counted through all rows.
+    Cut {
+        /// Parts of a row, of which its width is a multiple.
+        parts: usize,
+        /// `[N_new]`, indices into the parts of the old rows.
+        source: Tensor<1, Int>,
+    },
     /// All rows restart.
     Restart,
 }
 
 impl MomentEdit {
-    /// The moment `[N, width]` after the edit, `[N_new, width]`.
+    /// The moment `[N, width]` after the edit, `[N_new, width]`, or `[N_new, width / parts]` where
+    /// rows are cut.
     pub fn apply(&self, moment: Tensor<2>) -> Tensor<2> {
         match self {
+            Self::Cut { parts, source } => {
+                let [rows, width] = moment.dims();
+                let width = width / (*parts).max(1);
+                if source.dims()[0] == 0 {
+                    return Tensor::zeros([0, width], (&moment.device(), moment.dtype()));
+                }
+                moment
+                    .reshape([rows * parts, width])
+                    .select(0, source.clone())
+            }
+            Self::Gather { source, .. } if source.dims()[0] == 0 => {
+                let [_, width] = moment.dims();
+                Tensor::zeros([0, width], (&moment.device(), moment.dtype()))
+            }
             Self::Gather { source, restarts } => {
                 let [_, width] = moment.dims();
                 let moment = moment.select(0, source.clone());

@@ -75,7 +75,9 @@ impl<O: Optimizer> RowOptimizer for ThroughHost<O> {
             return state;
         };
         let (rows, device) = match edit {
-            MomentEdit::Gather { source, .. } => (source.dims()[0], Some(source.device())),
+            MomentEdit::Gather { source, .. } | MomentEdit::Cut { source, .. } => {
+                (source.dims()[0], Some(source.device()))
+            }
             MomentEdit::Restart => (state.rows, None),
         };
         // Restarting means dropping the state.
@@ -84,6 +86,16 @@ impl<O: Optimizer> RowOptimizer for ThroughHost<O> {
         };
         let mut sink = StateSink::default();
         inner.state_flatten("", &mut sink);
+        // Something of another shape than the parameter has no parts.
+        if let MomentEdit::Cut { parts, .. } = edit {
+            let has_parts = |data: &TensorData| match data.shape()[..] {
+                [first, width] => first == state.rows && width.is_multiple_of((*parts).max(1)),
+                _ => false,
+            };
+            if !sink.tensors.iter().all(|(_, data)| has_parts(data)) {
+                return HostState { rows, inner: None };
+            }
+        }
         let mut source = StateSource::new(sink.scalars.into_iter().collect());
         for (name, data) in sink.tensors {
             source.insert_tensor(name, edited(data, state.rows, edit, &device));
@@ -109,6 +121,9 @@ fn edited(data: TensorData, rows: usize, edit: &MomentEdit, device: &Device) -> 
     let moment = Tensor::<2>::from_data(TensorData::new(values, [rows, width]), device);
     let moment = edit.apply(moment);
     shape[0] = moment.dims()[0];
+    if let (MomentEdit::Cut { .. }, Some(width)) = (edit, shape.get_mut(1)) {
+        *width = moment.dims()[1];
+    }
     match moment.into_data().convert::<f32>().try_into_vec::<f32>() {
         Ok(values) => TensorData::new(values, shape).convert_dtype(dtype),
         Err(_) => data,

@@ -95,6 +95,7 @@ fn before(file: &Reference, setup: &Setup) -> Optimized<Gaussians> {
         opacity_logits: Param::from_tensor(Tensor::<1>::from_data(logits, options)),
         sh0: three("sh0", 1),
         sh_rest: Some(three("sh_rest", 15)),
+        sh_starts: None,
     };
     let scale = SceneScale::new(1.0).unwrap();
     let rates = LearningRates::default();

@@ -10,18 +10,29 @@ use super::{Saved, record};
 use crate::ShColorSettings;
 use crate::backend::{
     OpInputs, ShColorGradients, ShColorInputs, ShColorTensors, ShColorsBackend, ShColorsOps,
+    ShLayout,
 };
 
 #[derive(Debug, Clone)]
 struct ShColors<B: ShColorsBackend> {
     inputs: ShColorInputs<B>,
+    layout: ShLayout<B>,
     settings: ShColorSettings,
 }
 
 impl<B: ShColorsBackend> ShColors<B> {
-    fn new(inputs: ShColorInputs<B>, settings: ShColorSettings) -> (FloatTensor<B>, Self) {
-        let colors = B::sh_colors(inputs.clone(), settings);
-        (colors, Self { inputs, settings })
+    fn new(
+        inputs: ShColorInputs<B>,
+        layout: ShLayout<B>,
+        settings: ShColorSettings,
+    ) -> (FloatTensor<B>, Self) {
+        let colors = B::sh_colors(inputs.clone(), layout.clone(), settings);
+        let saved = Self {
+            inputs,
+            layout,
+            settings,
+        };
+        (colors, saved)
     }
 
     fn backward(
@@ -30,7 +41,7 @@ impl<B: ShColorsBackend> ShColors<B> {
         needs_grad: ShColorTensors<bool>,
     ) -> ShColorGradients<B> {
         let _span = trace_span!("colours gradient").entered();
-        B::sh_colors_backward(self.inputs, grad, self.settings, needs_grad)
+        B::sh_colors_backward(self.inputs, self.layout, grad, self.settings, needs_grad)
     }
 }
 
@@ -65,6 +76,7 @@ impl<B: ShColorsBackend> Saved<B, 4> for ShColors<B> {
 impl<B: ShColorsBackend, C: CheckpointStrategy> ShColorsOps for Autodiff<B, C> {
     fn sh_colors(
         OpInputs(inputs): ShColorInputs<Self>,
+        layout: ShLayout<Self>,
         settings: ShColorSettings,
     ) -> FloatTensor<Self> {
         let sh0 = inputs.sh0.node();
@@ -73,8 +85,13 @@ impl<B: ShColorsBackend, C: CheckpointStrategy> ShColorsOps for Autodiff<B, C> {
             .as_ref()
             .map(|rest| [rest, &inputs.means, &inputs.centers].map(|input| input.node()));
         let inputs = OpInputs(inputs.map_inputs(|input| input.into_primitive()));
-        let tracked = |inputs| ShColors::new(inputs, settings);
-        let plain = |inputs| B::sh_colors(inputs, settings);
+        let layout = match layout {
+            ShLayout::Uniform => ShLayout::Uniform,
+            ShLayout::Ragged(starts) => ShLayout::Ragged(starts),
+        };
+        let inputs = (inputs, layout);
+        let tracked = |(inputs, layout)| ShColors::new(inputs, layout, settings);
+        let plain = |(inputs, layout)| B::sh_colors(inputs, layout, settings);
         match others {
             Some([rest, means, centers]) => record::<B, C, ShColors<B>, _, 4>(
                 [sh0, rest, means, centers],

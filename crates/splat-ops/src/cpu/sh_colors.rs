@@ -2,8 +2,12 @@
 //!
 //! Directions and basis functions are the same arithmetic for every Gaussian, so they are computed
 //! in columns, as SIMD code. Coefficients are stored in rows, and read and written there.
+//!
+//! Where Gaussians have different degrees, blocks are of Gaussians of one degree, so that those of
+//! a low one cost no more than it takes.
 
 use core::marker::PhantomData;
+use core::ops::Range;
 
 use burn::backend::Flex;
 use burn::backend::flex::FlexTensor;
@@ -16,6 +20,7 @@ use super::spherical_harmonics::{COUNT_MAX, basis, normalize};
 use super::uninit::Uncleared;
 use crate::backend::{
     OpInputs, PROJECTED_EXTENT, PROJECTED_WIDTH, ShColorInputs, ShColorTensors, ShColorsOps,
+    ShLayout,
 };
 use crate::settings::{ClampGradient, ShColorSettings};
 use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
@@ -27,8 +32,10 @@ const CHUNK: usize = 512;
 struct Inputs<'a, T> {
     sh0: &'a [T],
     rest: &'a [T],
-    /// R.
+    /// R, if that of all Gaussians.
     stored: usize,
+    /// First row of `rest` of each Gaussian, and the end, if each has those of its own degree.
+    starts: Option<&'a [i32]>,
     means: &'a [T],
     centers: &'a [T],
     /// Packed splats.
@@ -38,13 +45,26 @@ struct Inputs<'a, T> {
     recovers: bool,
 }
 
+/// The starts of a layout that has some.
+fn starts_of(layout: ShLayout<Flex>) -> Option<Buffer> {
+    match layout {
+        ShLayout::Uniform => None,
+        ShLayout::Ragged(starts) => Some(Buffer::new(starts)),
+    }
+}
+
 impl<'a, T: Real> Inputs<'a, T> {
-    fn new(buffers: &'a ShColorTensors<Buffer, Option<Buffer>>, settings: ShColorSettings) -> Self {
+    fn new(
+        buffers: &'a ShColorTensors<Buffer, Option<Buffer>>,
+        starts: Option<&'a Buffer>,
+        settings: ShColorSettings,
+    ) -> Self {
         let rest = buffers.sh_rest.as_ref();
         Self {
             sh0: buffers.sh0.slice(),
             rest: rest.map_or(&[], Buffer::slice),
             stored: rest.map_or(0, |rest| rest.dims::<3>()[1]),
+            starts: starts.map(Buffer::slice),
             means: buffers.means.slice(),
             centers: buffers.centers.slice(),
             seen: buffers.seen.as_ref().map(Buffer::slice),
@@ -55,6 +75,40 @@ impl<'a, T: Real> Inputs<'a, T> {
 
     fn count(&self) -> usize {
         self.means.len() / 3
+    }
+
+    /// First row of the coefficients of a Gaussian after that of degree 0; for N the end.
+    #[inline(always)]
+    fn first_row(&self, n: usize) -> usize {
+        match self.starts {
+            None => self.stored * n,
+            Some(starts) => starts[n] as usize,
+        }
+    }
+
+    /// Passes on the Gaussians that are kept, in blocks of one degree, in order within each degree,
+    /// and the degree at which they are evaluated: the lesser of theirs and the one asked for.
+    fn for_each_block(
+        &self,
+        rows: Range<usize>,
+        is_kept: impl Fn(usize) -> bool,
+        mut visit: impl FnMut(usize, &[usize]),
+    ) {
+        let Some(starts) = self.starts else {
+            return for_each_block(rows, is_kept, |block| visit(self.degree, block));
+        };
+        for degree in 0..=self.degree {
+            let is_of_degree = |n: usize| {
+                let own = match starts[n + 1] - starts[n] {
+                    ..3 => 0,
+                    3..8 => 1,
+                    8..15 => 2,
+                    15.. => SH_DEGREE_MAX,
+                };
+                own.min(self.degree) == degree && is_kept(n)
+            };
+            for_each_block(rows.clone(), is_of_degree, |block| visit(degree, block));
+        }
     }
 
     /// Centre of a camera, and a function that tells whether the camera sees a Gaussian.
@@ -73,7 +127,7 @@ impl<'a, T: Real> Inputs<'a, T> {
     /// three channels, and the next number in memory or zero.
     #[inline(always)]
     fn rest<const REST: usize>(&self, n: usize) -> [[T; 4]; REST] {
-        let row = &self.rest[3 * self.stored * n..][..3 * REST];
+        let row = &self.rest[3 * self.first_row(n)..][..3 * REST];
         core::array::from_fn(|i| {
             let number = |j| {
                 if 3 * i + j < 3 * REST {
@@ -149,12 +203,13 @@ vectorized! {
     /// directions.
     fn colors_of_rows<T: Real, const FMA: bool>(
         inputs: &Inputs<T>,
+        degree: usize,
         rows: &[usize],
         first: usize,
         basis: &[Lanes<T>; COUNT_MAX],
         colors: &mut [T],
     ) {
-        by_degree!(inputs.degree, colors_of_degree::<T>(inputs, rows, first, basis, colors));
+        by_degree!(degree, colors_of_degree::<T>(inputs, rows, first, basis, colors));
     }
 }
 
@@ -215,30 +270,35 @@ fn evaluate_degree<T: Real, const DEGREE: usize>(
 }
 
 impl ShColorsOps for Flex {
-    fn sh_colors(OpInputs(inputs): ShColorInputs<Self>, settings: ShColorSettings) -> FlexTensor {
-        in_precision!(inputs.means, forward, inputs, settings)
+    fn sh_colors(
+        OpInputs(inputs): ShColorInputs<Self>,
+        layout: ShLayout<Self>,
+        settings: ShColorSettings,
+    ) -> FlexTensor {
+        in_precision!(inputs.means, forward, inputs, layout, settings)
     }
 }
 
 fn forward<T: Real>(
     _: PhantomData<T>,
     inputs: ShColorTensors<FlexTensor, Option<FlexTensor>>,
+    layout: ShLayout<Flex>,
     settings: ShColorSettings,
 ) -> FlexTensor {
-    let buffers = inputs.map_inputs(Buffer::new);
-    let inputs = Inputs::<T>::new(&buffers, settings);
+    let (buffers, starts) = (inputs.map_inputs(Buffer::new), starts_of(layout));
+    let inputs = Inputs::<T>::new(&buffers, starts.as_ref(), settings);
     let (c, n) = (inputs.centers.len() / 3, inputs.count());
     let mut colors = Uncleared::<T>::new(c * n * 3);
     let parts = colors.chunks_of_each(c, 3 * CHUNK);
     parts.into_par_iter().for_each(|(camera, first, part)| {
         let (center, is_seen) = inputs.camera(camera);
         let (first, colors) = (first / 3, part.cleared());
-        for_each_block(first..first + colors.len() / 3, is_seen, |rows| {
+        inputs.for_each_block(first..first + colors.len() / 3, is_seen, |degree, rows| {
             let directions = inputs.directions(rows.iter().copied(), center);
             let mut units = [[T::ZERO; LANES]; 4];
             let mut basis = [[T::ZERO; LANES]; COUNT_MAX];
-            evaluate(inputs.degree, &directions, &mut units, &mut basis);
-            colors_of_rows(&inputs, rows, first, &basis, colors);
+            evaluate(degree, &directions, &mut units, &mut basis);
+            colors_of_rows(&inputs, degree, rows, first, &basis, colors);
         });
     });
     tensor(colors.written(), [c, n, 3])

@@ -11,6 +11,7 @@ use splat_kernels::sh_colors as kernels;
 use super::{buffer, gradients, prepare, tensor};
 use crate::backend::{
     OpInputs, ShColorGradients, ShColorInputs, ShColorTensors, ShColorsBackend, ShColorsOps,
+    ShLayout,
 };
 use crate::settings::ShColorSettings;
 
@@ -27,7 +28,10 @@ fn prepared(
     }
 }
 
-fn buffers(inputs: &ShColorTensors<CubeTensor, Option<CubeTensor>>) -> kernels::ShColorInputs {
+fn buffers(
+    inputs: &ShColorTensors<CubeTensor, Option<CubeTensor>>,
+    layout: ShLayout<CubeBackend>,
+) -> kernels::ShColorInputs {
     kernels::ShColorInputs {
         sh0: buffer(&inputs.sh0),
         sh_rest: inputs.sh_rest.as_ref().map(|rest| match rest.dtype {
@@ -41,6 +45,11 @@ fn buffers(inputs: &ShColorTensors<CubeTensor, Option<CubeTensor>>) -> kernels::
             _ => kernels::ShRest::Exact(buffer(rest)),
         }),
         stored: inputs.sh_rest.as_ref().map_or(0, |rest| rest.shape()[1]),
+        starts: match layout {
+            ShLayout::Uniform => None,
+            // In 32 bits, and not negative: read as they are.
+            ShLayout::Ragged(starts) => Some(buffer(&into_contiguous(starts))),
+        },
         means: buffer(&inputs.means),
         centers: buffer(&inputs.centers),
         seen: inputs.seen.as_ref().map(buffer),
@@ -48,10 +57,14 @@ fn buffers(inputs: &ShColorTensors<CubeTensor, Option<CubeTensor>>) -> kernels::
 }
 
 impl ShColorsOps for CubeBackend {
-    fn sh_colors(OpInputs(inputs): ShColorInputs<Self>, settings: ShColorSettings) -> CubeTensor {
+    fn sh_colors(
+        OpInputs(inputs): ShColorInputs<Self>,
+        layout: ShLayout<Self>,
+        settings: ShColorSettings,
+    ) -> CubeTensor {
         let inputs = prepared(inputs);
         let (means, centers) = (&inputs.means, &inputs.centers);
-        let colors = kernels::sh_colors(&means.client, &buffers(&inputs), settings);
+        let colors = kernels::sh_colors(&means.client, &buffers(&inputs, layout), settings);
         let shape = [centers.shape()[0], means.shape()[0], 3];
         tensor(means, colors, Shape::from(shape))
     }
@@ -60,6 +73,7 @@ impl ShColorsOps for CubeBackend {
 impl ShColorsBackend for CubeBackend {
     fn sh_colors_backward(
         OpInputs(inputs): ShColorInputs<Self>,
+        layout: ShLayout<Self>,
         grad_colors: CubeTensor,
         settings: ShColorSettings,
         needs_grad: ShColorTensors<bool>,
@@ -68,7 +82,7 @@ impl ShColorsBackend for CubeBackend {
         let grad_colors = prepare(grad_colors);
         let grads = kernels::sh_colors_backward(
             &grad_colors.client,
-            &buffers(&inputs),
+            &buffers(&inputs, layout),
             &buffer(&grad_colors),
             settings,
             needs_grad,

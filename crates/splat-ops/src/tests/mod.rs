@@ -10,6 +10,7 @@ mod probe;
 mod project;
 mod screen_statistics;
 mod sh_colors;
+mod sh_degrees;
 
 use burn::tensor::Device;
 

@@ -22,7 +22,7 @@ use super::trainer::Trainer;
 use super::watch::{Autosave, Watch};
 use super::{
     Checkpoint, CheckpointError, History, IntoLoss, LossTerms, Progress, StrategyKind, TrainError,
-    TrainSettings, Warning, resolution_schedule, views,
+    TrainSettings, Warning, resolution_schedule, sh_reduction, views,
 };
 use crate::calibration::{
     BundleAdjustment, CalibrationSchedule, RefineIntrinsics, RefinePoses, adjust_bundle,
@@ -410,10 +410,15 @@ fn optimized<M: SplatModel>(
     scene: SceneScale,
     optimizer: &MakeOptimizer,
 ) -> Result<Optimized<M>, TrainError> {
-    let fields = model.fields(&config.learning_rates.for_steps(config.steps));
     let usual = |field: &Field| SplatAdam::of_field(field, config.adam_rows(), scene).into();
     let optimizer = |field: &Field| optimizer(field).unwrap_or_else(|| usual(field));
-    Optimized::new(model, fields, optimizer).map_err(|error| TrainError::Setup(error.to_string()))
+    let rates = config.learning_rates.for_steps(config.steps);
+    let model = Optimized::of_model(model, &rates, optimizer);
+    let model = model.map_err(|error| TrainError::Setup(error.to_string()))?;
+    if config.sh_reduction.is_some() {
+        sh_reduction::check(model.model())?;
+    }
+    Ok(model)
 }
 
 /// Fewer Gaussians stay in the order of their points until the first refinement.

@@ -6,7 +6,7 @@ use std::collections::BTreeSet;
 use serde::{Deserialize, Serialize};
 use splat_model::ops::{AdamRows, ClampGradient, RasterizeSettings};
 use splat_model::strategy::{AdcSettings, ImprovedGsSettings, McmcSettings};
-use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale};
+use splat_model::{InitSettings, LearningRates, RenderSettings, SceneScale, ShReductionSettings};
 
 use splat_data::Capture;
 use splat_data::text::{one_line, utf8};
@@ -95,6 +95,14 @@ pub struct TrainSettings {
     /// The strategy `improved`. Where `max_gaussians` is absent, growth ends as it does for
     /// `density`.
     pub improved: ImprovedGsSettings,
+    /// Fewer spherical harmonics for Gaussians whose colours hardly depend on the view, once in the
+    /// run and on the evidence of all training views, see
+    /// [`reduce_sh_degrees`](splat_model::reduce_sh_degrees); not before the highest degree is
+    /// trained. From then on a Gaussian of degree 0 has 14 parameters instead of 59, and steps are
+    /// of all Gaussians, whatever `sparse_share` says; with `seen_rows_only`, coefficients are rows
+    /// of their own. Default none.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sh_reduction: Option<ShReductionSettings>,
     /// Refinement of the cameras. Default none.
     pub calibration: CalibrationSettings,
 }
@@ -146,6 +154,7 @@ impl Default for TrainSettings {
             density: AdcSettings::default(),
             mcmc: McmcSettings::default(),
             improved: ImprovedGsSettings::default(),
+            sh_reduction: None,
             calibration: CalibrationSettings::default(),
         }
     }
@@ -285,6 +294,15 @@ impl TrainSettings {
         }
         (self.mcmc.validate()).map_err(|problem| problem.replacen('`', "`mcmc.", 1))?;
         (self.improved.validate()).map_err(|problem| problem.replacen('`', "`improved.", 1))?;
+        if let Some(reduction) = &self.sh_reduction {
+            (reduction.validate()).map_err(|problem| problem.replacen('`', "`sh_reduction.", 1))?;
+            if self.init.sh_degree == 0 {
+                return Err(
+                    "`sh_reduction` lowers degrees of spherical harmonics, and `init.sh_degree` is 0: leave it out"
+                        .to_owned(),
+                );
+            }
+        }
         (self.calibration.validate())
             .map_err(|problem| problem.replacen('`', "`calibration.", 1))?;
         if let Some(color) = self.background
@@ -454,6 +472,7 @@ mod tests {
             ..TrainSettings::default()
         };
         config.learning_rates.means = 0.1 + 0.2;
+        config.sh_reduction = Some(ShReductionSettings::new().with_std(0.06));
         let text = toml::to_string(&config).unwrap();
         for text in [
             text.clone(),
@@ -544,6 +563,15 @@ mod tests {
             found.contains("`improved.selection.final_share`"),
             "{found}"
         );
+        let found = problem(&|config| {
+            config.sh_reduction = Some(ShReductionSettings::new().with_at(1.0));
+        });
+        assert!(found.contains("`sh_reduction.at`"), "{found}");
+        let found = problem(&|config| {
+            config.sh_reduction = Some(ShReductionSettings::new());
+            config.init.sh_degree = 0;
+        });
+        assert!(found.contains("`init.sh_degree` is 0"), "{found}");
         let found = problem(&|config| config.mcmc.growth = 0.5);
         assert!(found.contains("`mcmc.growth`"), "{found}");
         let found = problem(&|config| config.improved.reset_opacity = 0.003);

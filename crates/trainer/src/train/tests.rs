@@ -2,6 +2,7 @@
 
 mod calibration;
 mod extensions;
+mod sh_reduction;
 mod sparse;
 mod strategies;
 

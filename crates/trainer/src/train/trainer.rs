@@ -201,6 +201,7 @@ impl<M: SplatModel> Trainer<M> {
             };
             self.strategy(&done, &mut FieldGradients::new(), &[], Moment::After)?;
         }
+        self.reduce_sh_degrees()?;
         self.in_step = false;
         Ok(())
     }
@@ -504,7 +505,7 @@ struct Backward {
     screen: Vec<ScreenView>,
 }
 
-fn hook_view(training_index: usize, view: &View) -> HookView<'_> {
+pub(super) fn hook_view(training_index: usize, view: &View) -> HookView<'_> {
     HookView {
         training_index: Some(training_index),
         name: &view.name,

@@ -21,6 +21,7 @@ use splat_data::Camera;
 use splat_ops::{AdamGap, OpError, ProjectSettings, RowGroups};
 
 use super::fields::{FieldVisitor, GradientsOf, change};
+use super::owned::Owner;
 use super::{FieldGradients, FieldStep, Optimized};
 use crate::SplatModel;
 use crate::field::{Field, GAUSSIANS};
@@ -113,7 +114,8 @@ type MissedByField = BTreeMap<String, Vec<Missed>>;
 
 impl<M: SplatModel> SparseOptimized<M> {
     /// A model whose rows are all up to date.
-    pub fn new(model: Optimized<M>) -> Self {
+    pub fn new(mut model: Optimized<M>) -> Self {
+        model.owner.get_or_insert_with(Owner::new);
         Self {
             behind: model,
             group: GROUP,
@@ -180,7 +182,8 @@ impl<M: SplatModel> SparseOptimized<M> {
     }
 
     /// True if steps of some rows are the same as steps of all: the model says that its Gaussians
-    /// are independent ([`SplatModel::is_row_wise`]), every field of theirs is stepped by
+    /// are independent ([`SplatModel::is_row_wise`]; those of different degrees of spherical
+    /// harmonics are not in rows of their own alone), every field of theirs is stepped by
     /// [`SplatAdam`](crate::optimizer::SplatAdam), and no gradient waits for another step.
     pub fn can_be_sparse(&self) -> bool {
         let rows: Vec<&Field> = self.row_fields().collect();

@@ -10,17 +10,20 @@ use rayon::prelude::*;
 use super::super::buffer::{Buffer, tensor};
 use super::super::math::{Vec3, dot};
 use super::super::real::Real;
-use super::super::simd::{LANES, Lanes, for_each_block, vectorized};
+use super::super::simd::{LANES, Lanes, vectorized};
 use super::super::spherical_harmonics::{COUNT_MAX, basis_gradient, guarded_dot, is_zero};
 use super::super::uninit::{Part, Uncleared};
-use super::{CHUNK, Inputs, evaluate};
-use crate::backend::{OpInputs, ShColorGradients, ShColorInputs, ShColorTensors, ShColorsBackend};
+use super::{CHUNK, Inputs, evaluate, starts_of};
+use crate::backend::{
+    OpInputs, ShColorGradients, ShColorInputs, ShColorTensors, ShColorsBackend, ShLayout,
+};
 use crate::settings::ShColorSettings;
 use crate::spherical_harmonics::{SH_DEGREE_MAX, sh_coefficient_count};
 
 impl ShColorsBackend for Flex {
     fn sh_colors_backward(
         OpInputs(inputs): ShColorInputs<Self>,
+        layout: ShLayout<Self>,
         grad_colors: FlexTensor,
         settings: ShColorSettings,
         needs_grad: ShColorTensors<bool>,
@@ -29,6 +32,7 @@ impl ShColorsBackend for Flex {
             grad_colors,
             backward,
             inputs,
+            layout,
             grad_colors,
             settings,
             needs_grad
@@ -97,8 +101,8 @@ impl<T: Real> Chunk<'_, T> {
         let mut of_center = [T::ZERO; 3];
         let (center, is_seen) = inputs.camera(camera);
         let is_graded = |row: usize| !is_zero(&grad[3 * row..3 * row + 3]) && is_seen(row);
-        for_each_block(self.rows.clone(), is_graded, |rows| {
-            self.add_block(rows, inputs, center, grad, &mut of_center);
+        inputs.for_each_block(self.rows.clone(), is_graded, |degree, rows| {
+            self.add_block(degree, rows, inputs, center, grad, &mut of_center);
         });
         self.is_clear = false;
         of_center
@@ -106,6 +110,7 @@ impl<T: Real> Chunk<'_, T> {
 
     fn add_block(
         &mut self,
+        degree: usize,
         rows: &[usize],
         inputs: &Inputs<T>,
         center: &[T],
@@ -115,15 +120,15 @@ impl<T: Real> Chunk<'_, T> {
         let mut units = [[T::ZERO; LANES]; 4];
         let mut basis = [[T::ZERO; LANES]; COUNT_MAX];
         let directions = inputs.directions(rows.iter().copied(), center);
-        evaluate(inputs.degree, &directions, &mut units, &mut basis);
+        evaluate(degree, &directions, &mut units, &mut basis);
 
         let mut weights = [[T::ZERO; LANES]; COUNT_MAX];
-        add_to_rows(self, rows, inputs, &basis, grad, &mut weights);
+        add_to_rows(self, degree, rows, inputs, &basis, grad, &mut weights);
         if !self.directions {
             return;
         }
         let mut gradients = [[T::ZERO; LANES]; 3];
-        evaluate_backward(inputs.degree, &units, &weights, &mut gradients);
+        evaluate_backward(degree, &units, &weights, &mut gradients);
         for (lane, n) in rows.iter().enumerate() {
             for axis in 0..3 {
                 of_center[axis] -= gradients[axis][lane];
@@ -144,13 +149,14 @@ vectorized! {
     /// functions.
     fn add_to_rows<T: Real, const FMA: bool>(
         chunk: &mut Chunk<T>,
+        degree: usize,
         rows: &[usize],
         inputs: &Inputs<T>,
         basis: &[Lanes<T>; COUNT_MAX],
         grad: &[T],
         weights: &mut [Lanes<T>; COUNT_MAX],
     ) {
-        by_degree!(inputs.degree, add_to_degree::<T>(chunk, rows, inputs, basis, grad, weights));
+        by_degree!(degree, add_to_degree::<T>(chunk, rows, inputs, basis, grad, weights));
     }
 }
 
@@ -177,7 +183,8 @@ fn add_to_degree<T: Real, const REST: usize>(
             add_scaled(&mut chunk.sh0[3 * i..3 * i + 3], basis[0][lane], grad);
         }
         if !chunk.rest.is_empty() {
-            let rest = &mut chunk.rest[3 * inputs.stored * i..][..3 * REST];
+            let row = inputs.first_row(*n) - inputs.first_row(chunk.rows.start);
+            let rest = &mut chunk.rest[3 * row..][..3 * REST];
             let values = core::array::from_fn(|i| basis[1 + i][lane]);
             if chunk.is_clear {
                 write_scaled::<T, REST>(rest, values, grad);
@@ -229,32 +236,43 @@ fn add_scaled<T: Real>(sums: &mut [T], scale: T, values: Vec3<T>) {
 fn backward<T: Real>(
     _: PhantomData<T>,
     inputs: ShColorTensors<FlexTensor, Option<FlexTensor>>,
+    layout: ShLayout<Flex>,
     grad: FlexTensor,
     settings: ShColorSettings,
     needs_grad: ShColorTensors<bool>,
 ) -> ShColorGradients<Flex> {
-    let buffers = inputs.map_inputs(Buffer::new);
-    let inputs = Inputs::<T>::new(&buffers, settings);
+    let (buffers, starts) = (inputs.map_inputs(Buffer::new), starts_of(layout));
+    let inputs = Inputs::<T>::new(&buffers, starts.as_ref(), settings);
     let grad = Buffer::new(grad);
     let grad = grad.slice::<T>();
     let (c, n) = (inputs.centers.len() / 3, inputs.count());
 
-    let widths = [3, 3 * inputs.stored, 3];
+    let rest_shape = buffers.sh_rest.as_ref().map_or([0; 3], Buffer::dims);
+    let lengths = [3 * n, rest_shape.iter().product(), 3 * n];
     let needed = [needs_grad.sh0, needs_grad.sh_rest, needs_grad.means];
-    let mut out = [0, 1, 2].map(|i| Uncleared::<T>::new(if needed[i] { n * widths[i] } else { 0 }));
+    let mut out = [0, 1, 2].map(|i| Uncleared::<T>::new(if needed[i] { lengths[i] } else { 0 }));
     let [sh0, rest, means] = &mut out;
-    let mut parts = [(sh0, widths[0]), (rest, widths[1]), (means, widths[2])]
-        .map(|(out, width)| out.chunks(CHUNK * width).into_iter());
-    let parts: Vec<[Option<Part<T>>; 3]> = (0..n.div_ceil(CHUNK))
-        .map(|_| parts.each_mut().map(Iterator::next))
+    let chunks = || {
+        let firsts = (0..n).step_by(CHUNK);
+        firsts.map(|first| first..n.min(first + CHUNK))
+    };
+    let rest_lengths =
+        chunks().map(|rows| 3 * (inputs.first_row(rows.end) - inputs.first_row(rows.start)));
+    let mut parts = [
+        sh0.chunks(3 * CHUNK),
+        rest.parts(rest_lengths.filter(|_| needed[1])),
+        means.chunks(3 * CHUNK),
+    ]
+    .map(Vec::into_iter);
+    let parts: Vec<_> = chunks()
+        .map(|rows| (rows, parts.each_mut().map(Iterator::next)))
         .collect();
     let of_centers: Vec<Vec<Vec3<T>>> = parts
         .into_par_iter()
-        .enumerate()
-        .map(|(chunk, parts)| {
+        .map(|(rows, parts)| {
             let [sh0, rest, means] = parts.map(|part| part.map_or(&mut [][..], Part::cleared));
             let mut chunk = Chunk {
-                rows: chunk * CHUNK..n.min((chunk + 1) * CHUNK),
+                rows,
                 sh0,
                 rest,
                 means,
@@ -277,9 +295,7 @@ fn backward<T: Real>(
     let [sh0, rest, means] = out.map(Uncleared::written);
     ShColorTensors {
         sh0: needs_grad.sh0.then(|| tensor(sh0, [n, 1, 3])),
-        sh_rest: needs_grad
-            .sh_rest
-            .then(|| tensor(rest, [n, inputs.stored, 3])),
+        sh_rest: needs_grad.sh_rest.then(|| tensor(rest, rest_shape)),
         means: needs_grad.means.then(|| tensor(means, [n, 3])),
         centers: needs_grad.centers.then(|| tensor(centers, [c, 3])),
         seen: None,

@@ -85,7 +85,8 @@ fn history(history: &History, step: usize) -> Result<(), String> {
     }
     let counts = history.counts.iter().map(|(at, _)| *at);
     let scores = history.held_out_psnr.iter().map(|(at, _)| *at);
-    match counts.chain(scores).find(|at| *at > step) {
+    let reduced = history.sh_reduction.iter().map(|reduced| reduced.step);
+    match counts.chain(scores).chain(reduced).find(|at| *at > step) {
         None => Ok(()),
         Some(at) => Err(format!(
             "`history` has an entry of step {at}, in a run of {step}"
