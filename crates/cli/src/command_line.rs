@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use super::GlobalArgs;
+use super::photos::PhotoArgs;
 
 /// A command of this program, built argument by argument.
 #[derive(Debug, Clone)]
@@ -28,6 +29,14 @@ impl CommandLine {
     pub(super) fn option(mut self, name: &str, path: &Path) -> Self {
         self.0 += &format!(" {name}");
         self.path(path)
+    }
+
+    /// Adds the options for reading photos that were given.
+    pub(super) fn photos(self, photos: &PhotoArgs) -> Self {
+        let words = photos.words();
+        words.chunks_exact(2).fold(self, |line, pair| {
+            line.option(&pair[0].to_string_lossy(), Path::new(&pair[1]))
+        })
     }
 
     /// Adds an option without a value.

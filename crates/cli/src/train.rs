@@ -15,6 +15,7 @@ use super::device::ChosenDevice;
 use super::photos::{self, PhotoArgs};
 use super::{Failure, GlobalArgs, device, eval, interrupt, print, text};
 use crate::report::progress::Progress;
+pub(super) use results::CAMERAS;
 use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
 use resume::Interrupted;
 use splat_data::{Capture, CaptureSettings};
@@ -183,17 +184,11 @@ impl TrainArgs {
     }
 
     /// Adds what is read of the capture, which is no setting of the run, to a command.
-    fn images(&self, mut line: CommandLine) -> CommandLine {
-        if let Some(folder) = &self.photos.images {
-            line = line.option("--images", folder);
-        }
-        if let Some(rule) = &self.photos.hold_out {
-            line = line.option("--hold-out", rule.as_ref());
-        }
-        if let Some(memory) = self.photos.photo_memory {
-            line = line.option("--photo-memory", memory.to_string().as_ref());
-        }
-        line
+    fn images(&self, line: CommandLine) -> CommandLine {
+        line.photos(&PhotoArgs {
+            downscale: None,
+            ..self.photos.clone()
+        })
     }
 
     /// The command that resumes the run in `out`. Its settings are in the checkpoint.

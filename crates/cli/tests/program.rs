@@ -177,6 +177,23 @@ fn cameras_are_refined_and_written() {
         said.contains("opencv  fx") && said.contains("  k1 "),
         "{said}"
     );
+    // The capture's cameras are not those that the scene fits; the command that is named has them.
+    let eval = |words: &[&str]| {
+        let mut program = Command::new(env!("CARGO_BIN_EXE_splat"));
+        let output = program.arg("eval").args(words).output().unwrap();
+        succeed(&output);
+        String::from_utf8_lossy(&output.stderr).into_owned()
+    };
+    let scene = out.join("scene.ply");
+    let given = ["--device", "cpu", "--downscale", "4"];
+    let said = eval(&[&[text(&capture), text(&scene)], &given[..]].concat());
+    let warning = said
+        .lines()
+        .find(|line| line.contains("refined its cameras"));
+    let (_, again) = warning.unwrap().split_once("splat eval ").unwrap();
+    assert!(again.contains("--downscale 4"), "{again}");
+    let said = eval(&again.split_whitespace().collect::<Vec<_>>());
+    assert!(!said.contains("refined its cameras"), "{said}");
     // Refined cameras are replaced with the scene that they belong to.
     let refined = ["--steps", "5", "--refine-intrinsics"];
     succeed(&train(&capture, &out, &refined));

@@ -23,6 +23,7 @@ use clap::Args;
 use super::{Failure, GlobalArgs, device, print, write, write_svg};
 use crate::command_line::CommandLine;
 use crate::interrupt;
+use crate::photos::PhotoArgs;
 use crate::report::{probe_file, probe_folder};
 use csv::Table;
 use measure::Bench;
@@ -64,9 +65,8 @@ pub(super) struct RecipesArgs {
     /// 30000]
     #[arg(long, value_name = "N")]
     steps: Option<usize>,
-    /// Area-average the photos by this factor
-    #[arg(long, value_name = "K", default_value_t = 1)]
-    downscale: u32,
+    #[command(flatten)]
+    photos: PhotoArgs,
     /// Runs of each recipe on each capture, with the seeds 0, 1, ...
     #[arg(long, value_name = "N", default_value_t = 3,
         value_parser = clap::value_parser!(u64).range(1..=MOST_SEEDS))]
@@ -85,7 +85,7 @@ pub(super) fn run(args: &RecipesArgs, global: &GlobalArgs) -> Result<(), Failure
             "--seed: the runs have the seeds 0, 1, ...; say how many with --seeds".to_owned(),
         ));
     }
-    let mut plan = Plan::new(args.recipes()?, args.seeds, args.steps, args.downscale)?;
+    let mut plan = Plan::new(args.recipes()?, args.seeds, args.steps, args.photos.clone())?;
     plan.take_captures(&args.captures, &args.out)?;
     let chosen = device::open(global)?;
     plan.device = chosen.name.clone();
@@ -138,10 +138,7 @@ impl RecipesArgs {
 
     /// The command that goes on with what is missing.
     fn again(&self, global: &GlobalArgs) -> CommandLine {
-        let mut options = vec![
-            ("--downscale", self.downscale.to_string()),
-            ("--seeds", self.seeds.to_string()),
-        ];
+        let mut options = vec![("--seeds", self.seeds.to_string())];
         options.extend(self.steps.map(|steps| ("--steps", steps.to_string())));
         if !self.recipes.is_empty() {
             options.push(("--recipes", self.recipes.join(",")));
@@ -153,7 +150,7 @@ impl RecipesArgs {
         for (name, value) in options {
             line = line.option(name, Path::new(&value));
         }
-        line.option("--out", &self.out)
+        line.photos(&self.photos).option("--out", &self.out)
     }
 }
 

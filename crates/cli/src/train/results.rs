@@ -36,7 +36,7 @@ pub(super) const METRICS: &str = "metrics.json";
 const LOSSES: &str = "losses.csv";
 const CURVES: &str = "curves.svg";
 /// The folder of refined cameras, a COLMAP model.
-pub(super) const CAMERAS: &str = "cameras";
+pub(crate) const CAMERAS: &str = "cameras";
 /// The folder of undistorted photos with their cameras.
 const UNDISTORTED: &str = "undistorted";
 /// The pictures' folder.

@@ -15,6 +15,7 @@ mod settings;
 
 pub(crate) use align::Aligning;
 pub use align::{AlignedScores, align_pose};
+pub(crate) use bundle::adjust_bundle_unless;
 pub use bundle::{BundleAdjustment, adjust_bundle};
 pub use intrinsics::RefineIntrinsics;
 pub use poses::RefinePoses;

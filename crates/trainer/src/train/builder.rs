@@ -1,7 +1,7 @@
 //! How a run is described before it begins.
 
 use std::sync::Arc;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::Receiver;
 use std::time::{Duration, Instant};
 
@@ -25,7 +25,7 @@ use super::{
     TrainSettings, Warning, resolution_schedule, sh_reduction, views,
 };
 use crate::calibration::{
-    BundleAdjustment, CalibrationSchedule, RefineIntrinsics, RefinePoses, adjust_bundle,
+    BundleAdjustment, CalibrationSchedule, RefineIntrinsics, RefinePoses, adjust_bundle_unless,
 };
 use crate::hooks::{Hook, Hooks};
 
@@ -335,7 +335,11 @@ fn adjusted(
     if !(settings.poses && settings.bundle_adjustment) {
         return Ok(None);
     }
-    let Some(adjusted) = adjust_bundle(capture)? else {
+    let adjusted = adjust_bundle_unless(&watch.interrupt, capture)?;
+    if watch.interrupt.load(Ordering::Relaxed) {
+        return Err(TrainError::Interrupted);
+    }
+    let Some(adjusted) = adjusted else {
         (watch.on_warning)(&Warning::TooFewKeypoints);
         return Ok(None);
     };

@@ -29,7 +29,7 @@ pub use error::CheckpointError;
 pub(super) use run::RunRecord;
 
 /// File format version; a reader refuses others.
-const VERSION: u32 = 4;
+const VERSION: u32 = 5;
 /// Key of the metadata entry for everything except tensors.
 const META: &str = "burn_splat";
 /// Key of the metadata entry with the checksum of everything else, so that corruption on disk is

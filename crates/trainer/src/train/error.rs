@@ -44,6 +44,9 @@ pub enum TrainError {
     /// The model, the strategy or a hook is unusable.
     #[error("{0}")]
     Setup(String),
+    /// The run was interrupted before its first step, so that there is nothing to save.
+    #[error("interrupted while the poses were adjusted to keypoints; no step was taken")]
+    Interrupted,
     /// The loss has no terms, or does not depend on the rendered image.
     #[error("the loss {0}")]
     Loss(&'static str),

@@ -138,12 +138,12 @@ impl Record {
                 device: self.text("device").to_owned(),
             },
             digest: self.text("digest").to_owned(),
-            psnr: self.number("psnr")?,
-            ssim: self.number("ssim")?,
+            psnr: self.measure("psnr")?,
+            ssim: self.measure("ssim")?,
             gaussians: self.number("gaussians")?,
             most_gaussians: self.number("most_gaussians")?,
-            seconds: self.number("seconds")?,
-            outside_seconds: self.number("outside_seconds")?,
+            seconds: self.measure("seconds")?,
+            outside_seconds: self.measure("outside_seconds")?,
             ply_bytes: self.number("ply_bytes")?,
             spz_bytes: self.number("spz_bytes")?,
             view: (!view.is_empty()).then(|| view.to_owned()),
@@ -164,10 +164,19 @@ impl Record {
         text.parse().map_err(|_| unusable())
     }
 
+    /// A number that was measured. Infinity is one: PSNR of two equal pictures.
+    fn measure(&self, name: &str) -> Result<f64, String> {
+        match self.number::<f64>(name)? {
+            value if value.is_nan() => Err(self.problem(format_args!("`{name}` is not a number"))),
+            value => Ok(value),
+        }
+    }
+
     fn curve(&self) -> Result<Vec<(f64, f64)>, String> {
         let pair = |text: &str| -> Option<(f64, f64)> {
             let (seconds, psnr) = text.split_once(':')?;
-            Some((seconds.parse().ok()?, psnr.parse().ok()?))
+            let (seconds, psnr): (f64, f64) = (seconds.parse().ok()?, psnr.parse().ok()?);
+            (!seconds.is_nan() && !psnr.is_nan()).then_some((seconds, psnr))
         };
         let point = |text: &str| {
             pair(text).ok_or_else(|| {
@@ -262,8 +271,12 @@ mod tests {
             words.contains("line 4") && words.contains("`psnr` cannot be `much`"),
             "{words}"
         );
-        let words = refused(&text.replace("5:19 ", "5;19 "));
-        assert!(words.contains("line 2: `curve`"), "{words}");
+        for wrong in ["5;19 ", "5:NaN "] {
+            let words = refused(&text.replace("5:19 ", wrong));
+            assert!(words.contains("line 2: `curve`"), "{words}");
+        }
+        let words = refused(&text.replace(",21,", ",NaN,"));
+        assert!(words.contains("line 4: `psnr` is not"), "{words}");
         let words = refused(&text[..text.len() - 30]);
         assert!(words.contains("line 4: "), "{words}");
         let words = refused(&text.replace("b\"", "b"));

@@ -161,18 +161,23 @@ mod tests {
     use super::super::plan::{Named, Subject};
     use super::super::row::example;
     use super::*;
+    use crate::photos::PhotoArgs;
 
     const BASE: &str = "default";
 
     #[test]
     fn the_page_has_both_tables_and_the_share() {
         let recipes = [BASE, "mcmc"].map(|name| Named::of_text(name).unwrap());
+        let photos = PhotoArgs {
+            downscale: Some(4),
+            ..PhotoArgs::default()
+        };
         let plan = Plan {
             captures: vec![Subject {
                 name: "a|b".to_owned(),
                 folder: "a|b".into(),
             }],
-            ..Plan::new(recipes.into(), 2, Some(100), 4).unwrap()
+            ..Plan::new(recipes.into(), 2, Some(100), photos).unwrap()
         };
         let mut rows = [
             example("a|b", BASE, 0, 20.0),

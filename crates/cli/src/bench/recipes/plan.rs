@@ -1,12 +1,14 @@
 //! The runs to make, in turns, and which of them are missing.
 
+use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use super::pictures;
 use super::row::{Key, Row, digest};
+use crate::photos::{self, PhotoArgs};
 use crate::report::refuse_inputs;
 use crate::text::read_config;
-use crate::{Failure, GlobalArgs, photos};
+use crate::{Failure, GlobalArgs};
 use splat_data::{Capture, CaptureSettings};
 use splat_trainer::{RECIPES, Recipe, TrainSettings};
 
@@ -64,7 +66,9 @@ pub(super) struct Plan {
     pub seeds: u64,
     /// Steps of a run, if they are not the recipe's.
     pub steps: Option<usize>,
-    /// Factor by which photos are area-averaged.
+    /// How photos are read.
+    pub photos: PhotoArgs,
+    /// Factor by which they are area-averaged.
     pub downscale: u32,
     /// Name of the device.
     pub device: String,
@@ -82,8 +86,8 @@ pub(super) struct Run {
     pub capture: usize,
     pub recipe: Named,
     pub key: Key,
-    /// Digest of the program's version, the folder of the capture and all settings: a result is of
-    /// this run only if it has the same.
+    /// Digest of the program's version, the folder of the capture, the choice of its views and all
+    /// settings: a result is of this run only if it has the same.
     digest: String,
 }
 
@@ -93,8 +97,9 @@ impl Plan {
         recipes: Vec<Named>,
         seeds: u64,
         steps: Option<usize>,
-        downscale: u32,
+        photos: PhotoArgs,
     ) -> Result<Self, Failure> {
+        let downscale = photos.options().downscale;
         for (index, recipe) in recipes.iter().enumerate() {
             let same = |other: &Named| other.name.to_lowercase() == recipe.name.to_lowercase();
             if recipes[..index].iter().any(same) {
@@ -113,6 +118,7 @@ impl Plan {
             recipes,
             seeds,
             steps,
+            photos,
             downscale,
             device: String::new(),
         })
@@ -126,7 +132,7 @@ impl Plan {
             capture.check_trainable()?;
             if capture.split.test.is_empty() {
                 return Err(Failure::BadInput(format!(
-                    "{}: the capture holds out no view, so there is nothing to compare recipes on; let its split name one",
+                    "{}: the capture holds out no view, so there is nothing to compare recipes on; name some with --hold-out",
                     folder.display()
                 )));
             }
@@ -153,13 +159,23 @@ impl Plan {
 
     /// How captures are read.
     fn reading(&self) -> CaptureSettings {
-        CaptureSettings::new().with_downscale(self.downscale)
+        self.photos.options()
     }
 
     /// Reads the capture of a run, with its photos.
     pub(super) fn load(&self, run: &Run, global: &GlobalArgs) -> Result<Capture, Failure> {
         let folder = &self.captures[run.capture].folder;
         Ok(photos::load(folder, &self.reading(), global)?)
+    }
+
+    /// What tells the views and photos of a run from those of others, beside their size.
+    fn views(&self) -> Vec<OsString> {
+        let chosen = PhotoArgs {
+            downscale: None,
+            photo_memory: None,
+            ..self.photos.clone()
+        };
+        chosen.words()
     }
 
     /// All runs, in turns: with each seed, each recipe once on each capture.
@@ -171,9 +187,10 @@ impl Plan {
                     let settings = settings(recipe, self.steps, self.downscale, seed);
                     let folder = subject.folder.canonicalize();
                     let folder = folder.unwrap_or_else(|_| subject.folder.clone());
-                    let version = env!("CARGO_PKG_VERSION");
+                    let (version, folder) = (env!("CARGO_PKG_VERSION"), folder.display());
+                    let views = self.views();
                     runs.push(Run {
-                        digest: digest(&format!("{version} {} {settings:?}", folder.display())),
+                        digest: digest(&format!("{version} {folder} {settings:?} {views:?}")),
                         capture,
                         recipe: recipe.clone(),
                         key: Key {
@@ -265,10 +282,14 @@ mod tests {
             name: name.to_owned(),
             folder: name.into(),
         };
+        let photos = PhotoArgs {
+            downscale: Some(4),
+            ..PhotoArgs::default()
+        };
         Plan {
             captures: ["a", "b"].map(subject).into(),
             device: "cpu".to_owned(),
-            ..Plan::new(recipes.into(), 2, Some(100), 4).unwrap()
+            ..Plan::new(recipes.into(), 2, Some(100), photos).unwrap()
         }
     }
 
@@ -360,9 +381,26 @@ mod tests {
     }
 
     #[test]
+    fn runs_with_other_views_are_others() {
+        let rows = vec![row("a", "mcmc", 0)];
+        let missing = |change: fn(&mut PhotoArgs)| {
+            let mut plan = plan();
+            change(&mut plan.photos);
+            plan.missing(&rows).len()
+        };
+        assert_eq!(missing(|_| {}), 7);
+        assert_eq!(missing(|photos| photos.photo_memory = Some(100)), 7);
+        assert_eq!(missing(|photos| photos.hold_out = Some("3".into())), 8);
+        assert_eq!(missing(|photos| photos.images = Some("images_2".into())), 8);
+    }
+
+    #[test]
     fn unusable_settings_are_refused() {
         let recipe = Named::of_text("default").unwrap();
-        let refused = |recipes, steps| Plan::new(recipes, 1, steps, 1).err().unwrap().to_string();
+        let refused = |recipes, steps| {
+            let planned = Plan::new(recipes, 1, steps, PhotoArgs::default());
+            planned.err().unwrap().to_string()
+        };
         let words = refused(vec![recipe.clone(), recipe.clone()], None);
         assert!(words.contains("two are called default"), "{words}");
         let words = refused(vec![recipe], Some(0));

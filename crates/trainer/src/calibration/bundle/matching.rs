@@ -4,6 +4,8 @@
 //! patch around a corner is turned and scaled there. The search is by normalised correlation, in
 //! photos of a quarter of the size and then as they are.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use glam::{DMat4, DVec3};
 use rayon::prelude::*;
 use splat_data::{BoundedLens, Camera, CaptureError, View};
@@ -86,9 +88,13 @@ impl Photos {
     }
 
     /// Looks for the corners of every photo in its neighbours, up to a share of the longer side
-    /// away from where the poses and these points have them.
-    pub fn matched(&self, points: &[DVec3], reach: f64) -> Matched {
-        let of_photo = |index: usize| self.matches_of(index, points, reach);
+    /// away from where the poses and these points have them. Fewer photos are searched if the flag
+    /// becomes true.
+    pub fn matched(&self, interrupt: &AtomicBool, points: &[DVec3], reach: f64) -> Matched {
+        let of_photo = |index: usize| match interrupt.load(Ordering::Relaxed) {
+            true => vec![],
+            false => self.matches_of(index, points, reach),
+        };
         let found: Vec<_> = (0..self.0.len()).into_par_iter().map(of_photo).collect();
         let mut matched = Matched {
             points: vec![],

@@ -14,6 +14,8 @@ mod normal;
 mod picture;
 mod problem;
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use glam::{DMat4, DVec3};
 use splat_data::{Capture, CaptureError, View};
 
@@ -96,6 +98,14 @@ pub struct BundleAdjustment {
 /// # Errors
 /// When a photo on the disk cannot be read.
 pub fn adjust_bundle(capture: &Capture) -> Result<Option<BundleAdjustment>, CaptureError> {
+    adjust_bundle_unless(&AtomicBool::new(false), capture)
+}
+
+/// [`adjust_bundle`], given up soon after a flag becomes true; the result is then of no use.
+pub(crate) fn adjust_bundle_unless(
+    interrupt: &AtomicBool,
+    capture: &Capture,
+) -> Result<Option<BundleAdjustment>, CaptureError> {
     let views: Vec<&View> = capture.train_views().collect();
     let points = capture.points.iter().map(|p| DVec3::from_array(p.position));
     let unknowns = Unknowns {
@@ -103,12 +113,13 @@ pub fn adjust_bundle(capture: &Capture) -> Result<Option<BundleAdjustment>, Capt
         points: points.collect(),
     };
     match capture.observations.is_empty() {
-        false => Ok(of_observations(capture, &views, unknowns)),
-        true => of_corners(&views, unknowns),
+        false => Ok(of_observations(interrupt, capture, &views, unknowns)),
+        true => of_corners(interrupt, &views, unknowns),
     }
 }
 
 fn of_observations(
+    interrupt: &AtomicBool,
     capture: &Capture,
     views: &[&View],
     mut unknowns: Unknowns,
@@ -116,7 +127,7 @@ fn of_observations(
     let problem = Problem::of_capture(capture, views)?;
     let before = problem.errors(&unknowns).median();
     for free_points in [false, true] {
-        minimize(&problem, &mut unknowns, free_points);
+        minimize(interrupt, &problem, &mut unknowns, free_points);
     }
     Some(BundleAdjustment {
         points: unknowns.points.iter().map(DVec3::to_array).collect(),
@@ -124,13 +135,17 @@ fn of_observations(
     })
 }
 
-fn of_corners(views: &[&View], start: Unknowns) -> Result<Option<BundleAdjustment>, CaptureError> {
+fn of_corners(
+    interrupt: &AtomicBool,
+    views: &[&View],
+    start: Unknowns,
+) -> Result<Option<BundleAdjustment>, CaptureError> {
     let mut photos = Photos::of(views)?;
     let mut viewmats = start.viewmats;
     let mut adjusted: Option<BundleAdjustment> = None;
     for reach in REACHES {
         photos.place(&viewmats);
-        let matched = photos.matched(&start.points, reach);
+        let matched = photos.matched(interrupt, &start.points, reach);
         let mut unknowns = Unknowns {
             viewmats,
             points: matched.points,
@@ -139,11 +154,11 @@ fn of_corners(views: &[&View], start: Unknowns) -> Result<Option<BundleAdjustmen
             return Ok(None);
         };
         let before = problem.errors(&unknowns).median();
-        minimize(&problem, &mut unknowns, true);
+        minimize(interrupt, &problem, &mut unknowns, true);
         let Some(problem) = problem.without_outliers(&unknowns, OUTLIER) else {
             return Ok(None);
         };
-        minimize(&problem, &mut unknowns, true);
+        minimize(interrupt, &problem, &mut unknowns, true);
         let next = result(&problem, &unknowns, before, views);
         adjusted = Some(BundleAdjustment {
             // Wrong matches agree with the poses that follow from them, but new ones do not.
@@ -189,10 +204,18 @@ fn longer(views: &[&View]) -> f64 {
 
 /// Levenberg's and Marquardt's method: Gauss and Newton's step, whose diagonal grows while steps
 /// fail and shrinks while they succeed.
-fn minimize(problem: &Problem<'_>, unknowns: &mut Unknowns, free_points: bool) {
+fn minimize(
+    interrupt: &AtomicBool,
+    problem: &Problem<'_>,
+    unknowns: &mut Unknowns,
+    free_points: bool,
+) {
     let mut damping = 1e-4;
     let mut now = problem.linearized(unknowns);
     for _ in 0..STEPS {
+        if interrupt.load(Ordering::Relaxed) {
+            return;
+        }
         // Huber's bound follows the errors, and is the same for both sides of a comparison.
         let cost = Cost {
             quadratic: QUADRATIC * now.errors.median(),

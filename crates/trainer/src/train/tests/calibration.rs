@@ -207,6 +207,24 @@ fn too_few_keypoints_are_said() {
     assert_eq!(*warnings.lock().unwrap(), [Warning::TooFewKeypoints]);
 }
 
+/// Poses that were adjusted in part would be those of another run.
+#[test]
+fn an_adjustment_that_is_interrupted_is_no_run() {
+    let calibration = CalibrationSettings::new().with_poses(true);
+    let settings = TrainSettings::new()
+        .with_steps(1)
+        .with_calibration(calibration);
+    let mut without = turned_with_keypoints();
+    without.observations.clear();
+    for capture in [turned_with_keypoints(), without] {
+        let built = builder_on(Arc::new(capture))
+            .settings(settings.clone())
+            .interrupt(Arc::new(AtomicBool::new(true)))
+            .build();
+        assert!(matches!(built.err(), Some(TrainError::Interrupted)));
+    }
+}
+
 #[test]
 fn keypoints_of_other_photos_are_left_aside() {
     let mut other = turned_with_keypoints();
