@@ -70,6 +70,7 @@
 
 pub use burn;
 pub use splat_data as data;
+pub use splat_data::glam;
 #[cfg(feature = "lab")]
 pub use splat_lab as lab;
 pub use splat_model as model;

@@ -13,11 +13,12 @@ pub use splat_model::strategy::{
 };
 pub use splat_model::{
     CameraTensors, Field, FieldStep, Gaussians, InitSettings, LearningRates, Moments, Optimized,
-    RenderSettings, RowEdit, SplatModel, losses, project_gaussians, render, splats_from_points,
+    RenderSettings, RowEdit, ShReductionSettings, SplatModel, losses, project_gaussians,
+    reduce_sh_degrees, render, splats_from_points,
 };
 pub use splat_ops::{
-    AdamRows, OpError, ProjectSettings, Projected, RasterizeSettings, Rendered, project, rasterize,
-    sh_colors,
+    AdamRows, OpError, ProjectSettings, Projected, RasterizeSettings, Rendered, ShRest, ShStarts,
+    project, rasterize, sh_colors,
 };
 pub use splat_trainer::{
     Hook, HookView, LossTerms, StrategyKind, TargetView, TrainSettings, Trained, Trainer, evaluate,

@@ -58,7 +58,7 @@ impl std::fmt::Display for CommandLine {
 }
 
 /// A path as one word, which cannot be mistaken for an option.
-fn quoted(path: &Path) -> String {
+pub(super) fn quoted(path: &Path) -> String {
     let text = path.to_string_lossy();
     let text = match text.starts_with('-') {
         true => format!("./{text}"),

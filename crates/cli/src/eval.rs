@@ -1,13 +1,11 @@
 //! `splat eval`: scores of a scene on a capture's views.
 
 use std::fmt::Write;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
 use clap::{Args, ValueEnum};
 
-use super::command_line::CommandLine;
 use super::photos::PhotoArgs;
-use super::train::CAMERAS;
 use super::{Failure, GlobalArgs, device, print, scene};
 use crate::report::metrics::write_json;
 use crate::report::{probe_files, refuse_inputs};
@@ -19,7 +17,8 @@ use splat_trainer::{Scores, evaluate};
 #[command(after_help = "Examples:
   splat eval examples/data/saharov out/saharov/scene.ply
   splat eval photos/ scene.ply --split all --json scores.json
-  splat eval photos/ scene.ply --images images_4")]
+  splat eval photos/ scene.ply --images images_4
+  splat eval photos/ out/photos/scene.ply --cameras out/photos/cameras")]
 pub struct EvalArgs {
     /// Capture: a folder with `images/` and `sparse/0/`
     pub capture: PathBuf,
@@ -66,7 +65,7 @@ pub(super) fn run(args: &EvalArgs, global: &GlobalArgs) -> Result<(), Failure> {
     }
     let device = device::open(global)?.device;
     let (gaussians, settings) = scene::open(&args.scene, &device, args.sh_precision, global)?;
-    warn_of_refined_cameras(args, global);
+    args.photos.warn_of_refined(&args.scene, global);
     probe_files([&args.json])?;
     refuse_inputs(args.json.clone(), [args.scene.as_path()])?;
     let scores = evaluate(&gaussians, &views, &settings, &device, |_, _| {})?;
@@ -75,31 +74,6 @@ pub(super) fn run(args: &EvalArgs, global: &GlobalArgs) -> Result<(), Failure> {
         write_json(path, &scores)?;
     }
     Ok(())
-}
-
-/// Says that the scene's run refined its cameras, where others are used here: the scene fits those.
-fn warn_of_refined_cameras(args: &EvalArgs, global: &GlobalArgs) {
-    let refined = args.scene.with_file_name(CAMERAS);
-    let used = args.capture.canonicalize().ok();
-    // A later run without refinement removes the files, not the folder.
-    if !refined.join("cameras.bin").is_file() || refined.canonicalize().ok() == used {
-        return;
-    }
-    let photos = args.photos.images.as_deref();
-    let photos = args.capture.join(photos.unwrap_or(Path::new("images")));
-    let photos = PhotoArgs {
-        images: Some(std::path::absolute(&photos).unwrap_or(photos)),
-        ..args.photos.clone()
-    };
-    let again = CommandLine::new("eval", global)
-        .path(&refined)
-        .path(&args.scene)
-        .photos(&photos);
-    global.say(format_args!(
-        "warning: the run of {} refined its cameras, and the scores are by those of {}; for the refined ones: {again}",
-        args.scene.display(),
-        args.capture.display(),
-    ));
 }
 
 /// The scores as text, one view per line, the means last.

@@ -5,6 +5,8 @@ use std::process::ExitCode;
 
 use splat_data::text::one_line;
 
+use super::interrupt;
+
 /// Why a command failed. `Display` is the one line for the user.
 #[derive(Debug)]
 pub enum Failure {
@@ -12,6 +14,9 @@ pub enum Failure {
     BadInput(String),
     /// A check ran and failed: exit status 1.
     Check(String),
+    /// Ctrl-C came before there was anything to save: exit status 130, as of a program that it ends
+    /// at once.
+    Interrupted(String),
 }
 
 impl Failure {
@@ -20,13 +25,14 @@ impl Failure {
         match self {
             Self::Check(_) => ExitCode::from(1),
             Self::BadInput(_) => ExitCode::from(2),
+            Self::Interrupted(_) => ExitCode::from(interrupt::STATUS),
         }
     }
 
     /// The line without the kind of failure.
     pub(super) fn reason(self) -> String {
         match self {
-            Self::BadInput(reason) | Self::Check(reason) => reason,
+            Self::BadInput(reason) | Self::Check(reason) | Self::Interrupted(reason) => reason,
         }
     }
 }
@@ -36,6 +42,7 @@ impl fmt::Display for Failure {
         match self {
             Self::BadInput(reason) => write!(f, "error: {reason}"),
             Self::Check(reason) => write!(f, "failed: {reason}"),
+            Self::Interrupted(reason) => write!(f, "stopped: {reason}"),
         }
     }
 }

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Exit status of a program ended by Ctrl-C, by the convention of shells.
-const INTERRUPTED: i32 = 130;
+pub(super) const STATUS: u8 = 130;
 
 /// A flag that the first Ctrl-C sets.
 pub(super) fn flag() -> Result<Arc<AtomicBool>, ctrlc::Error> {
@@ -12,7 +12,7 @@ pub(super) fn flag() -> Result<Arc<AtomicBool>, ctrlc::Error> {
     let seen = Arc::clone(&flag);
     ctrlc::set_handler(move || {
         if seen.swap(true, Ordering::Relaxed) {
-            std::process::exit(INTERRUPTED);
+            std::process::exit(STATUS.into());
         }
     })?;
     Ok(flag)

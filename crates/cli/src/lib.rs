@@ -34,7 +34,9 @@ pub use gradcheck::{GradcheckArgs, Precision};
 /// Train, render, inspect and convert Gaussian splats.
 #[derive(Debug, Parser)]
 #[command(name = "splat", version, about, long_about = None)]
-#[command(after_help = "Exit status: 0 done, 1 a check failed, 2 bad input.")]
+#[command(
+    after_help = "Exit status: 0 done, 1 a check failed, 2 bad input, 130 ended by Ctrl-C with nothing saved."
+)]
 struct Cli {
     #[command(flatten)]
     global: GlobalArgs,

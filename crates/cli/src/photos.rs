@@ -7,6 +7,8 @@ use std::sync::{Mutex, PoisonError};
 
 use clap::Args;
 
+use super::command_line::quoted;
+use super::train::CAMERAS;
 use super::{Failure, GlobalArgs};
 use crate::report::progress::Progress;
 use splat_data::{Capture, CaptureError, CaptureSettings, SplitRule};
@@ -20,6 +22,10 @@ pub struct PhotoArgs {
     /// Folder of the photos, relative to the capture or absolute [default: images]
     #[arg(long, value_name = "DIR")]
     pub images: Option<PathBuf>,
+    /// Folder with a COLMAP model whose cameras and poses the views have in place of the capture's,
+    /// by name: `cameras/` of a run that refined them
+    #[arg(long, value_name = "DIR")]
+    pub cameras: Option<PathBuf>,
     /// Views to hold out of training: every K-th by name (0: none), names separated by commas, or a
     /// file that names them [default: those that the capture says, or every 8th]
     #[arg(long, value_name = "K|NAMES|FILE")]
@@ -76,6 +82,7 @@ impl PhotoArgs {
         CaptureSettings {
             downscale: self.downscale.unwrap_or(default.downscale),
             images: self.images.clone(),
+            cameras: self.cameras.clone(),
             split: self
                 .hold_out
                 .as_deref()
@@ -94,6 +101,20 @@ impl PhotoArgs {
         Ok(capture)
     }
 
+    /// Says so if the run of a scene refined its cameras and others are used: the scene fits the
+    /// refined ones.
+    pub(super) fn warn_of_refined(&self, scene: &Path, global: &GlobalArgs) {
+        let refined = scene.with_file_name(CAMERAS);
+        // A later run without refinement removes the files, not the folder.
+        if self.cameras.is_none() && refined.join("cameras.bin").is_file() {
+            global.say(format_args!(
+                "warning: the run of {} refined its cameras, and those of the capture are used; for the refined ones add --cameras {}",
+                scene.display(),
+                quoted(&refined)
+            ));
+        }
+    }
+
     /// Command-line words that repeat these options; empty if none were given.
     pub(super) fn words(&self) -> Vec<OsString> {
         let mut words: Vec<OsString> = Vec::new();
@@ -102,6 +123,9 @@ impl PhotoArgs {
         }
         if let Some(images) = &self.images {
             words.extend(["--images".into(), images.into()]);
+        }
+        if let Some(cameras) = &self.cameras {
+            words.extend(["--cameras".into(), cameras.into()]);
         }
         if let Some(rule) = &self.hold_out {
             words.extend(["--hold-out".into(), rule.into()]);
@@ -141,6 +165,7 @@ mod tests {
         for given in [
             &["--images", "my photos", "--downscale", "3"][..],
             &["--images", "/data/photos"],
+            &["--cameras", "out/run/cameras", "--hold-out", "a.jpg,b.jpg"],
             &["--downscale", "2"],
             &["--hold-out", "0", "--photo-memory", "100"],
             &["--hold-out", "a.jpg,b/c.jpg"],

@@ -20,7 +20,7 @@ use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
 use resume::Interrupted;
 use splat_data::{Capture, CaptureSettings};
 use splat_trainer::{
-    Checkpoint, RECIPES, Recipe, StrategyKind, TrainSettings, Trainer, TrainerBuilder,
+    Checkpoint, RECIPES, Recipe, StrategyKind, TrainError, TrainSettings, Trainer, TrainerBuilder,
 };
 
 /// The held-out views are measured this many times during a run, for the curves.
@@ -265,7 +265,11 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
             false => "adjusting the poses to the keypoints",
         });
     }
-    let trainer = shown(trainer, &progress).build()?;
+    let trainer = shown(trainer, &progress).build();
+    let trainer = trainer.map_err(|error| match error {
+        TrainError::Interrupted => Failure::Interrupted(error.to_string()),
+        error => error.into(),
+    })?;
     if let Some(adjusted) = trainer.bundle_adjustment().filter(|_| fresh) {
         global.say(format_args!(
             "{} of {} poses adjusted to {} keypoints{}: {:.2} pixels off in the median, {:.2} before",

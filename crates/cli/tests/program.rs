@@ -177,23 +177,32 @@ fn cameras_are_refined_and_written() {
         said.contains("opencv  fx") && said.contains("  k1 "),
         "{said}"
     );
-    // The capture's cameras are not those that the scene fits; the command that is named has them.
-    let eval = |words: &[&str]| {
+    // The run's figures are those of its own cameras, and others are used with a warning.
+    let eval = |more: &[&str]| {
+        let json = folder.path().join("scores.json");
+        let scene = out.join("scene.ply");
+        let words = [
+            &["--device", "cpu", "eval", text(&capture), text(&scene)][..],
+            &["--downscale", "4", "--json", text(&json)],
+            more,
+        ];
         let mut program = Command::new(env!("CARGO_BIN_EXE_splat"));
-        let output = program.arg("eval").args(words).output().unwrap();
+        let output = program.args(words.concat()).output().unwrap();
         succeed(&output);
-        String::from_utf8_lossy(&output.stderr).into_owned()
+        let scores: serde_json::Value =
+            serde_json::from_str(&fs::read_to_string(json).unwrap()).unwrap();
+        let said = String::from_utf8_lossy(&output.stderr).into_owned();
+        (scores["psnr"].as_f64().unwrap(), said)
     };
-    let scene = out.join("scene.ply");
-    let given = ["--device", "cpu", "--downscale", "4"];
-    let said = eval(&[&[text(&capture), text(&scene)], &given[..]].concat());
-    let warning = said
-        .lines()
-        .find(|line| line.contains("refined its cameras"));
-    let (_, again) = warning.unwrap().split_once("splat eval ").unwrap();
-    assert!(again.contains("--downscale 4"), "{again}");
-    let said = eval(&again.split_whitespace().collect::<Vec<_>>());
-    assert!(!said.contains("refined its cameras"), "{said}");
+    let (by_refined, said) = eval(&["--cameras", text(&cameras)]);
+    assert!(!said.contains("warning"), "{said}");
+    assert!(
+        (by_refined - aligned).abs() < 1e-3,
+        "{by_refined} for {aligned}"
+    );
+    let (by_own, said) = eval(&[]);
+    let advice = format!("add --cameras {}", text(&cameras));
+    assert!(said.contains(&advice) && by_own != by_refined, "{said}");
     // Refined cameras are replaced with the scene that they belong to.
     let refined = ["--steps", "5", "--refine-intrinsics"];
     succeed(&train(&capture, &out, &refined));

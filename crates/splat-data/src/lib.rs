@@ -36,6 +36,8 @@ pub use capture::{
     Capture, CaptureError, CaptureSettings, CaptureWarning, Observation, PhotoOnDisk, Point, Split,
     SplitRule, View,
 };
+/// Matrices and vectors in double precision, of which cameras are made.
+pub use glam;
 pub use replace::{
     WriteError, probe_file, probe_files, probe_folder, write_atomically, write_durably,
 };

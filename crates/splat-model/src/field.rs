@@ -6,8 +6,9 @@ use splat_data::SceneScale;
 pub const GAUSSIANS: usize = 0;
 
 /// The row set of the coefficients of spherical harmonics of [`Gaussians`](crate::Gaussians) of
-/// different degrees; a row is a coefficient of one function, of three channels.
-pub const SH_COEFFICIENTS: usize = 1;
+/// different degrees; a row is a coefficient of one function, of three channels. Far from the
+/// numbers that models give sets of their own.
+pub const SH_COEFFICIENTS: usize = 65_535;
 
 /// A trained parameter of a [`SplatModel`](crate::SplatModel).
 ///
@@ -30,7 +31,7 @@ pub struct Field {
     pub path: String,
     /// Row set of the first dimension, or `None` for a parameter without rows, which row edits
     /// leave alone. [`GAUSSIANS`] is the set of all Gaussians; a model may have others, with as
-    /// many rows as it likes. Those of some may belong to the Gaussians, see
+    /// many rows as it likes. Rows of such a set may belong to the Gaussians, see
     /// [`SplatModel::owned_rows`](crate::SplatModel::owned_rows).
     pub row_set: Option<usize>,
     /// Learning rate at the first step.

@@ -53,7 +53,7 @@ pub struct Gaussians {
     /// Spherical harmonics of the higher degrees, `[N, (degree + 1)^2 - 1, 3]`; absent for degree
     /// 0. Where Gaussians have different degrees, those of each Gaussian's own, `[K, 1, 3]`.
     pub sh_rest: Option<Param<Tensor<3>>>,
-    /// Which rows of `sh_rest` are whose, where Gaussians have different degrees; see
+    /// The first row of each Gaussian in `sh_rest`, where Gaussians have different degrees; see
     /// [`with_sh_degrees`](Self::with_sh_degrees).
     #[module(skip)]
     pub sh_starts: Option<ShStarts>,
@@ -115,8 +115,7 @@ impl Gaussians {
 
     /// Reads the scene back from the device. Render settings are not part of the model:
     /// [`SplatData::settings`] is empty. Where Gaussians have different degrees, the scene has the
-    /// highest that is in use, and zeros beyond that of a Gaussian, as files do;
-    /// [`SplatData::degree_of`] tells them.
+    /// highest that is in use, and zeros beyond that of a Gaussian, as files do.
     pub fn to_data(&self) -> SplatData {
         SplatData {
             origin: self.origin,

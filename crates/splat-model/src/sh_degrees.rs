@@ -70,10 +70,10 @@ impl Gaussians {
 
     pub(crate) fn keep_owned_rows(&mut self, most: &OwnedRows) -> Result<(), OpError> {
         let Some(rest) = self.sh_rest.take_if(|_| most.row_set() == SH_COEFFICIENTS) else {
-            return Err(wrong(format!(
-                "the Gaussians have no rows of a set {}",
-                most.row_set()
-            )));
+            return Err(wrong(match most.row_set() {
+                SH_COEFFICIENTS => "the Gaussians have no coefficients beyond degree 0".to_owned(),
+                set => format!("the Gaussians have no rows of a set {set}"),
+            }));
         };
         let own = self.coefficients_of(&rest.val());
         let starts = match most.gaussians() == self.len() {
@@ -85,9 +85,9 @@ impl Gaussians {
                 starts_of(&OwnedRows::of_counts(SH_COEFFICIENTS, kept), &rest.val())
             }
             false => Err(wrong(format!(
-                "{} Gaussians, but numbers of rows of {}",
-                self.len(),
-                most.gaussians()
+                "degrees of {} Gaussians for a model of {}",
+                most.gaussians(),
+                self.len()
             ))),
         };
         let starts = match starts {
@@ -163,7 +163,7 @@ impl Gaussians {
         if width > 0 {
             let pairs = starts.starts().windows(2);
             for (row, pair) in padded.chunks_exact_mut(width).zip(pairs) {
-                // Starts of other coefficients, which nothing else would take either, give zeros.
+                // Someone may have set starts that do not belong to these coefficients.
                 let own = values.get(3 * pair[0] as usize..3 * pair[1] as usize);
                 for (value, own) in row.iter_mut().zip(own.unwrap_or_default()) {
                     *value = *own;

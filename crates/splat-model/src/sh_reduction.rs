@@ -13,7 +13,7 @@
 //! opacity and how large it is there: a view that shows it from afar says less. The second mean of
 //! the paper is over views and multiplied by the transmittance, which is at most 1 and makes
 //! hidden Gaussians simpler; ours is divided by the weights, so that the thresholds are levels of
-//! colour whatever the size of photos and Gaussians. It drops no more than the paper's.
+//! colour whatever the size of photos and Gaussians.
 
 use burn::tensor::{Tensor, TensorData};
 use derive_setters::Setters;
@@ -90,27 +90,38 @@ impl ShReductionSettings {
 /// model, with its moments; the others go on as they were. Returns how many Gaussians have degree
 /// 0, 1, 2 and 3 then.
 ///
-/// `cameras` has one camera in each entry. Colours and weights are those of `render` at its degree,
-/// which should be the highest of the model. A Gaussian that no camera sees gets degree 0, with the
-/// coefficients that it has of that. Repeatable bit for bit where the rasteriser is.
+/// `cameras` has one camera in each entry. Colours and weights are those of `render`, at the
+/// highest degree. A Gaussian that no camera sees gets degree 0, with the coefficients that it has
+/// of that. Repeatable bit for bit where the rasteriser is.
 ///
 /// # Errors
-/// When the model has no coefficients beyond degree 0 that Gaussians own
-/// ([`SplatModel::keep_owned_rows`]), or as those of the ops. The model is then unchanged.
+/// When there is no camera, a setting cannot be used, or the model has no field `sh0` or no
+/// coefficients beyond degree 0 that Gaussians own ([`SplatModel::keep_owned_rows`]); and those of
+/// the ops. The model is then unchanged.
 pub fn reduce_sh_degrees<M: SplatModel>(
     model: &mut Optimized<M>,
     cameras: impl IntoIterator<Item = Result<CameraTensors, OpError>>,
     render: &RenderSettings,
     settings: &ShReductionSettings,
 ) -> Result<[usize; SH_DEGREE_MAX + 1], OpError> {
+    settings.validate().map_err(wrong)?;
+    let render = RenderSettings {
+        sh_degree: SH_DEGREE_MAX,
+        ..render.clone()
+    };
     let mut colors = ColorsOverViews::new(model.model().count());
+    let mut views = 0;
     for camera in cameras {
-        colors.add_view(model.model(), &camera?.detached(), render)?;
+        colors.add_view(model.model(), &camera?.detached(), &render)?;
+        views += 1;
+    }
+    if views == 0 {
+        return Err(wrong("no camera, so nothing says what is seen".to_owned()));
     }
     let lowered = colors.lowered(settings);
     let had: Option<Vec<u32>> = own_rows(model).map(|rows| rows.counts().collect());
-    model.keep_owned_rows(&rows_of_degrees(&lowered.degrees))?;
     let [mut sh0] = model.read_f64(["sh0"])?;
+    model.keep_owned_rows(&rows_of_degrees(&lowered.degrees))?;
     for (i, mean) in lowered.constant.iter().enumerate() {
         // One that was of degree 0 before has the colour that it was trained to.
         let varied = had.as_ref().is_none_or(|had| had[i] > 0);
@@ -129,6 +140,13 @@ pub fn reduce_sh_degrees<M: SplatModel>(
         counts[degree.unwrap_or(SH_DEGREE_MAX)] += 1;
     }
     Ok(counts)
+}
+
+fn wrong(what: String) -> OpError {
+    OpError::Argument {
+        op: "reduce_sh_degrees",
+        what,
+    }
 }
 
 fn own_rows<M: SplatModel>(model: &Optimized<M>) -> Option<crate::OwnedRows> {
@@ -173,10 +191,9 @@ impl ColorsOverViews {
     ) -> Result<(), OpError> {
         let [views, _, _] = cameras.viewmats.dims();
         if views != 1 {
-            return Err(OpError::Argument {
-                op: "reduce_sh_degrees",
-                what: format!("{views} cameras at once; give one at a time"),
-            });
+            return Err(wrong(format!(
+                "{views} cameras at once; give one at a time"
+            )));
         }
         let model = model.clone().no_grad();
         let projected = project_gaussians(&model, cameras, render)?;

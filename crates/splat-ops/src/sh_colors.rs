@@ -11,10 +11,14 @@ use crate::{OpError, Projected, SH_DEGREE_MAX, ShColorSettings, ShStarts, sh_coe
 
 /// Coefficients of the degrees above 0. An `Option<Tensor<3>>` converts into it.
 #[derive(Debug, Clone)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "one exists for each call, and is taken apart at once"
+)]
 pub enum ShRest {
     /// None: all Gaussians are of degree 0.
     None,
-    /// As many of each, `[N, R, 3]` with 1 + R >= (degree + 1)^2.
+    /// As many of each, `[N, R, 3]`: at least `(degree + 1)^2 - 1`.
     Uniform(Tensor<3>),
     /// As many as each Gaussian's own degree takes (reduced-3dgs, Papantonakis et al. 2024).
     Ragged {
@@ -40,12 +44,12 @@ impl From<Option<Tensor<3>>> for ShRest {
 ///
 /// # Arguments
 /// - `sh0` `[N, 1, 3]`: coefficients of degree 0.
-/// - `sh_rest`: coefficients of the higher degrees, `Some` tensor `[N, R, 3]` with 1 + R >= (degree
-///   + 1)^2, `None`, or [`ShRest::Ragged`], where a Gaussian is evaluated at the lesser of its own
-///   degree and `degree`. Those beyond `degree` are not read and get zero gradient; at degree 0 the
-///   tensor is not part of the graph. May be half precision (F16) if autodiff does not track it,
-///   which halves the bytes stored and read, rounds each coefficient to 2^-11 of itself, and leaves
-///   sums in full precision.
+/// - `sh_rest`: coefficients of the higher degrees, `None`, `Some` tensor `[N, R, 3]` of at least
+///   `(degree + 1)^2 - 1` each, or [`ShRest::Ragged`], where a Gaussian is evaluated at the lesser
+///   of its own degree and `degree`. Those beyond `degree` are not read and get zero gradient; at
+///   degree 0 the tensor is not part of the graph. May be half precision (F16) if autodiff does not
+///   track it, which halves the bytes stored and read, rounds each coefficient to 2^-11 of itself,
+///   and leaves sums in full precision.
 /// - `means` `[N, 3]`: world space.
 /// - `centers` `[C, 3]`: camera centres in world space.
 /// - `settings`: the degree, 0 to 3, and the gradient of the clamp; a degree alone will do.

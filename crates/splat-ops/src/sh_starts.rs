@@ -105,7 +105,7 @@ impl ShStarts {
         })
     }
 
-    /// The same on a device; a copy of the tensor if it is on another one.
+    /// These starts for ops on a device; their tensor is copied if it is on another one.
     #[must_use]
     pub fn on(&self, device: &Device) -> Self {
         let device = device.clone().without_autodiff();

@@ -5,8 +5,8 @@ use std::path::Path;
 use serde::Serialize;
 
 use super::{ReportError, write};
-use splat_trainer::Scores;
 use splat_trainer::calibration::AlignedScores;
+use splat_trainer::{Scores, ShReduced};
 
 /// Contents of `metrics.json`, in the order of its fields.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -21,6 +21,10 @@ pub struct Metrics {
     pub aligned: Option<AlignedScores>,
     /// Number of Gaussians.
     pub gaussians: usize,
+    /// When degrees of spherical harmonics were lowered, and how many Gaussians had which then;
+    /// absent if they were not.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub sh_reduction: Option<ShReduced>,
     /// Number of steps trained.
     pub steps: usize,
     /// Seconds spent training.
@@ -68,6 +72,7 @@ mod tests {
             scores: Scores::of_views(vec![view("a", 20.0, 0.5), view("b", 23.0, 0.75)]),
             aligned: None,
             gaussians: 3,
+            sh_reduction: None,
             steps: 10,
             seconds: 5.0,
             seconds_per_step: 0.5,

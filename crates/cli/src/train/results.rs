@@ -354,6 +354,7 @@ fn metrics(
     Metrics {
         scores: scores.clone(),
         gaussians: trained.model.len(),
+        sh_reduction: trained.history.sh_reduction,
         steps: trained.steps,
         seconds: seconds(trained.elapsed),
         seconds_per_step: seconds(trained.elapsed) / trained.steps as f64,

@@ -29,6 +29,7 @@ mod lens_checks;
 mod masks;
 mod observations;
 mod on_disk;
+mod other_cameras;
 mod photo_file;
 mod photo_loader;
 mod photo_memory;
@@ -136,6 +137,9 @@ pub struct CaptureSettings {
     /// Folder of the photos, relative to the capture or absolute. Default: `images`, or the
     /// capture's folder if that does not exist.
     pub images: Option<PathBuf>,
+    /// A folder with a COLMAP model whose cameras and poses the views have in place of the
+    /// capture's, by the names of their images, such as the refined ones of a run. Default: none.
+    pub cameras: Option<PathBuf>,
     /// Which views are held out of training. Default: those that the capture says.
     pub split: SplitRule,
     /// Most bytes of memory for the pixels of all photos. If they need more, every photo stays on
@@ -158,6 +162,7 @@ impl Default for CaptureSettings {
         Self {
             downscale: 1,
             images: None,
+            cameras: None,
             split: SplitRule::default(),
             memory: None,
             observations: false,
@@ -245,7 +250,10 @@ impl Capture {
             folder => folder,
         };
         let photos = images::folder(root, &model, options)?;
-        let views = images::load(root, &photos, &model, options, progress, &mut warnings)?;
+        let mut views = images::load(root, &photos, &model, options, progress, &mut warnings)?;
+        if let Some(folder) = &options.cameras {
+            other_cameras::take(folder, &mut views, &mut warnings)?;
+        }
         warnings.extend(lens_checks::fold_back(&model, &views));
         if model.points.is_empty() {
             let cameras: Vec<Camera> = views.iter().map(View::camera).collect();

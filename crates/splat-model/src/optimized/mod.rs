@@ -15,7 +15,7 @@ use burn::tensor::{Element, Gradients, Tensor, Transaction};
 use splat_data::SceneScale;
 use splat_ops::{AdamRows, OpError};
 
-use crate::field::Field;
+use crate::field::{Field, SH_COEFFICIENTS};
 use crate::opacity::logit;
 use crate::optimizer::{FieldOptimizer, MomentEdit, SplatAdam};
 use crate::{LearningRates, SplatModel};
@@ -88,11 +88,21 @@ impl<M: Module> Optimized<M> {
     /// [`SplatModel`], and knows of rows that belong to its Gaussians.
     ///
     /// # Errors
-    /// When the model has no parameter at a field's path, or two fields share a name.
+    /// When the model has no parameter at a field's path, two fields share a name, or a field is in
+    /// the row set [`SH_COEFFICIENTS`], whose rows would not follow their Gaussians here.
     pub fn new(
         model: M,
         fields: Vec<Field>,
         optimizer: impl Fn(&Field) -> FieldOptimizer,
+    ) -> Result<Self, OpError> {
+        Self::build(model, fields, optimizer, None)
+    }
+
+    fn build(
+        model: M,
+        fields: Vec<Field>,
+        optimizer: impl Fn(&Field) -> FieldOptimizer,
+        owner: Option<Owner<M>>,
     ) -> Result<Self, OpError> {
         let optimizers = (fields.iter())
             .map(|field| (field.name.clone(), optimizer(field)))
@@ -104,7 +114,7 @@ impl<M: Module> Optimized<M> {
             waiting: FieldGradients::new(),
             edits: 0,
             version: 0,
-            owner: None,
+            owner,
         };
         trained.check_fields()?;
         Ok(trained)
@@ -113,7 +123,7 @@ impl<M: Module> Optimized<M> {
     /// A model with an optimiser for each of its fields, whose rates are from `rates`.
     ///
     /// # Errors
-    /// Those of [`new`](Self::new).
+    /// When the model has no parameter at a field's path, or two fields share a name.
     pub fn of_model(
         model: M,
         rates: &LearningRates,
@@ -123,15 +133,13 @@ impl<M: Module> Optimized<M> {
         M: SplatModel,
     {
         let fields = model.fields(rates);
-        let mut trained = Self::new(model, fields, optimizer)?;
-        trained.owner = Some(Owner::new());
-        Ok(trained)
+        Self::build(model, fields, optimizer, Some(Owner::new()))
     }
 
     /// A model with [`SplatAdam`] for each of its fields, stepping `rows`.
     ///
     /// # Errors
-    /// Those of [`new`](Self::new).
+    /// Those of [`of_model`](Self::of_model).
     pub fn with_adam(
         model: M,
         rates: &LearningRates,
@@ -195,6 +203,13 @@ impl<M: Module> Optimized<M> {
         if let Some(field) = self.fields.iter().find(|field| field.name.contains('.')) {
             return wrong(format!(
                 "the name `{}` has a dot, which separates names in checkpoints",
+                field.name
+            ));
+        }
+        let owned = |field: &&Field| field.row_set == Some(SH_COEFFICIENTS);
+        if let (None, Some(field)) = (self.owner, self.fields.iter().find(owned)) {
+            return wrong(format!(
+                "the rows of `{}` belong to Gaussians of different degrees; make it with `Optimized::of_model`, where they follow them",
                 field.name
             ));
         }

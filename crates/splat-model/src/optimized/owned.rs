@@ -375,9 +375,9 @@ mod tests {
         for counts in [vec![0.5f32], vec![-1.0], vec![f32::NAN], vec![1e9]] {
             let mut record = record.clone();
             let data = TensorData::new(counts, [1, 1]);
-            record.tensors.insert("owned/1".into(), data);
+            record.tensors.insert("owned/65535".into(), data);
             let refused = OwnedRows::restore(&mut record.by_field()).unwrap_err();
-            assert!(refused.contains("`owned/1`"), "{refused}");
+            assert!(refused.contains("`owned/65535`"), "{refused}");
         }
         let mut record = StateRecord::default();
         record

@@ -19,7 +19,7 @@ impl<M: Module> Optimized<M> {
     /// Values and optimiser states of all fields, on the host: value `means` is tensor `means`, a
     /// moment of it `means.moment_1`. Values are `[N, width]`. Parameters that are not fields are
     /// included under `fixed/`, numbers of the rows of row set 1 that belong to each Gaussian as
-    /// `owned/1`.
+    /// `owned/65535`.
     ///
     /// # Errors
     /// When the device fails.
@@ -72,7 +72,7 @@ impl<M: Module> Optimized<M> {
     fn restore_all(&mut self, record: StateRecord, device: &Device) -> Result<(), String> {
         let mut fields = record.by_field();
         let owned = OwnedRows::restore(&mut fields)?;
-        self.lay_out(&owned)?;
+        self.arrange_owned(&owned)?;
         let shapes = self.shapes();
         let mut values = BTreeMap::new();
         let mut rows_of_set = BTreeMap::new();
@@ -150,7 +150,7 @@ impl<M: Module> Optimized<M> {
 
     /// Gives the model the row sets of a record that belong to its Gaussians, empty where it had
     /// none.
-    fn lay_out(&mut self, owned: &[OwnedRows]) -> Result<(), String> {
+    fn arrange_owned(&mut self, owned: &[OwnedRows]) -> Result<(), String> {
         let own = self.owned_rows();
         let missing = |own: &&OwnedRows| owned.iter().all(|rows| rows.row_set() != own.row_set());
         if let Some(missing) = own.iter().find(missing) {

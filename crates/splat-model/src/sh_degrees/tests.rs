@@ -4,7 +4,7 @@ use burn::tensor::{Device, Tensor, TensorData};
 use splat_ops::{AdamRows, OpError};
 
 use super::*;
-use crate::optimizer::StateRecord;
+use crate::optimizer::{SplatAdam, StateRecord};
 use crate::{
     Camera, CameraTensors, FieldStep, LearningRates, Lens, Moments, Optimized, RenderSettings,
     RowEdit, SceneScale, ShReductionSettings, SparseOptimized, SplatData, SplatModel,
@@ -192,7 +192,7 @@ fn coefficients_and_moments_go_where_their_gaussians_go() {
     model.edit_rows(&edit).unwrap();
     assert_eq!(model.model().sh_degrees(), [3, 1, 0, 2]);
     let after = model.save().unwrap();
-    assert_eq!(values(&after, "owned/1"), [15.0, 3.0, 0.0, 8.0]);
+    assert_eq!(values(&after, "owned/65535"), [15.0, 3.0, 0.0, 8.0]);
     // Rows before: 8 of the first, 3 of the third, 15 of the last.
     let rows = |record: &StateRecord, name: &str, from: usize, count: usize| {
         values(record, name)[3 * from..3 * (from + count)].to_vec()
@@ -293,22 +293,22 @@ fn a_saved_run_goes_on_with_other_rows_in_a_model_of_one_degree() {
         move |record: &mut StateRecord| {
             let shape = [counts.len(), 1];
             let data = TensorData::new(counts.clone(), shape);
-            record.tensors.insert("owned/1".into(), data);
+            record.tensors.insert("owned/65535".into(), data);
         }
     };
-    let mut counts = values(&saved, "owned/1");
+    let mut counts = values(&saved, "owned/65535");
     counts.pop();
-    assert!(refused(&with(counts.clone())).contains("`owned/1`"));
+    assert!(refused(&with(counts.clone())).contains("`owned/65535`"));
     // As many rows in all, but not those of degrees.
-    let mut counts = values(&saved, "owned/1");
+    let mut counts = values(&saved, "owned/65535");
     let places: Vec<usize> = (0..counts.len()).filter(|i| counts[*i] > 1.0).collect();
     counts[places[0]] -= 1.0;
     counts[places[1]] += 1.0;
     assert!(refused(&with(counts)).contains("0, 3, 8 or 15"));
-    assert!(refused(&|record| drop(record.tensors.remove("owned/1"))).contains("`sh_rest`"));
+    assert!(refused(&|record| drop(record.tensors.remove("owned/65535"))).contains("`sh_rest`"));
     let of_uniform = uniform(2).save().unwrap();
     let message = ragged(&[1, 2]).restore(of_uniform, &inner).unwrap_err();
-    assert!(message.contains("`owned/1` is missing"), "{message}");
+    assert!(message.contains("`owned/65535` is missing"), "{message}");
 }
 
 #[test]
@@ -326,6 +326,20 @@ fn rows_that_follow_the_gaussians_are_not_edited_apart() {
     assert!(SparseOptimized::new(uniform(2)).can_be_sparse());
 }
 
+/// Where nothing knows whose the coefficients are, an edit would leave them to other Gaussians.
+#[test]
+fn coefficients_that_would_not_follow_are_refused() {
+    let gaussians = Gaussians::from_data(&splats(2), &device());
+    let gaussians = gaussians.with_sh_degrees(&[1, 3]).unwrap();
+    let fields = gaussians.fields(&LearningRates::default());
+    let made = Optimized::new(gaussians, fields, |_| SplatAdam::new().into());
+    let message = made.unwrap_err().to_string();
+    assert!(
+        message.contains("`sh_rest`") && message.contains("of_model"),
+        "{message}"
+    );
+}
+
 #[test]
 fn degrees_that_a_model_does_not_have_are_refused() {
     let flat = SplatData {
@@ -334,9 +348,12 @@ fn degrees_that_a_model_does_not_have_are_refused() {
         ..splats(2)
     };
     let flat = Gaussians::from_data(&flat, &device());
-    assert!(flat.with_sh_degrees(&[0, 0]).is_err());
+    let refused = |gaussians: Gaussians, degrees: &[usize]| {
+        gaussians.with_sh_degrees(degrees).unwrap_err().to_string()
+    };
+    assert!(refused(flat, &[0, 0]).contains("no coefficients"));
     let gaussians = || Gaussians::from_data(&splats(2), &device());
-    assert!(gaussians().with_sh_degrees(&[0]).is_err());
+    assert!(refused(gaussians(), &[0]).contains("1 Gaussians for a model of 2"));
     assert!(gaussians().with_sh_degrees(&[0, 4]).is_err());
     let nowhere = OwnedRows::of_counts(7, [0, 0]);
     let mut model = optimized(gaussians());
@@ -448,5 +465,10 @@ fn a_reduction_that_cannot_be_done_changes_nothing() {
     let render_settings = RenderSettings::new();
     let failed = reduce_sh_degrees(&mut model, [Ok(two)], &render_settings, &settings);
     assert!(failed.unwrap_err().to_string().contains("one at a time"));
+    let failed = reduce_sh_degrees(&mut model, [], &render_settings, &settings);
+    assert!(failed.unwrap_err().to_string().contains("no camera"));
+    let broken = settings.with_std(f64::NAN);
+    let failed = reduce_sh_degrees(&mut model, cameras(), &render_settings, &broken);
+    assert!(failed.unwrap_err().to_string().contains("`std`"));
     assert_eq!(model.model().to_data(), splats(3));
 }

@@ -18,8 +18,9 @@ const COEFFICIENTS: usize = 8;
 /// A coefficient of a higher power moves so much slower than the one before: within the photo both
 /// bend its corner alike, and what the lower one can explain is left to it.
 const NEXT_POWER: f64 = 0.1;
-/// Steps between two looks at the domains of the lenses.
-const REFRESH: usize = 100;
+/// Steps between two looks at the domains of the lenses: a lens moves fastest at first, and outside
+/// of the domain that it began with nothing is drawn.
+const REFRESH: usize = 20;
 /// Name of the domains in a checkpoint, apart from those of parameters.
 const DOMAINS: &str = "domains";
 
@@ -284,7 +285,8 @@ impl Hook for RefineIntrinsics {
             };
             (rate * factor, FieldStep::Step(1.0))
         })?;
-        if at.step % REFRESH == REFRESH - 1 {
+        // The scores after the last step are those of the cameras that are written then.
+        if at.step % REFRESH == REFRESH - 1 || at.step + 1 == at.run.steps {
             self.refresh()?;
         }
         Ok(())

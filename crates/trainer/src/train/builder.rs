@@ -301,6 +301,11 @@ impl<M: SplatModel> TrainerBuilder<M> {
         if let Some(checkpoint) = resumed {
             checkpoint.restore(&mut state, &device)?;
         }
+        let photos = self.capture.split.train.len();
+        let never = sh_reduction::never_due(&config, schedule, photos);
+        if let (Some(warning), None) = (never, state.history.sh_reduction) {
+            (self.watch.on_warning)(&warning);
+        }
         if state.history.counts.is_empty() {
             let count = state.model.count();
             state.history.counts.push((0, count));

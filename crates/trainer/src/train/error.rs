@@ -45,7 +45,9 @@ pub enum TrainError {
     #[error("{0}")]
     Setup(String),
     /// The run was interrupted before its first step, so that there is nothing to save.
-    #[error("interrupted while the poses were adjusted to keypoints; no step was taken")]
+    #[error(
+        "interrupted before the first step, while the poses were adjusted; there is nothing to go on from"
+    )]
     Interrupted,
     /// The loss has no terms, or does not depend on the rendered image.
     #[error("the loss {0}")]

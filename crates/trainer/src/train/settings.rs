@@ -99,8 +99,8 @@ pub struct TrainSettings {
     /// run and on the evidence of all training views, see
     /// [`reduce_sh_degrees`](splat_model::reduce_sh_degrees); not before the highest degree is
     /// trained. From then on a Gaussian of degree 0 has 14 parameters instead of 59, and steps are
-    /// of all Gaussians, whatever `sparse_share` says; with `seen_rows_only`, coefficients are rows
-    /// of their own. Default none.
+    /// of all Gaussians, whatever `sparse_share` says; with `seen_rows_only`, a coefficient is
+    /// stepped if it has a gradient. Default none.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub sh_reduction: Option<ShReductionSettings>,
     /// Refinement of the cameras. Default none.

@@ -1,14 +1,12 @@
 //! Lower degrees of spherical harmonics, once in a run, where colours hardly depend on the view.
 
-use splat_model::strategy::StepInfo;
-use splat_model::{
-    CameraTensors, OwnedRows, RenderSettings, SH_COEFFICIENTS, SplatModel, reduce_sh_degrees,
-};
+use splat_model::strategy::{RunSchedule, StepInfo};
+use splat_model::{CameraTensors, OwnedRows, SH_COEFFICIENTS, SplatModel, reduce_sh_degrees};
 use splat_ops::{SH_DEGREE_MAX, sh_coefficient_count};
 use tracing::trace_span;
 
 use super::trainer::{Trainer, hook_view};
-use super::{ShReduced, TrainError, sh_schedule};
+use super::{ShReduced, TrainError, TrainSettings, Warning, sh_schedule};
 
 /// Checks, before the run, that degrees of a model can be lowered.
 pub(super) fn check<M: SplatModel>(model: &M) -> Result<(), TrainError> {
@@ -22,10 +20,37 @@ pub(super) fn check<M: SplatModel>(model: &M) -> Result<(), TrainError> {
     })
 }
 
+/// Whether the reduction is due after the step `at`: a share of the run has passed, and the highest
+/// degree has been trained. What was not trained yet is zero, and would be dropped.
+fn is_due(config: &TrainSettings, at: &StepInfo, photos: usize) -> bool {
+    let Some(settings) = config.sh_reduction else {
+        return false;
+    };
+    let trained = sh_schedule::degree(config, at, photos);
+    at.step as f64 >= settings.at * config.steps as f64
+        && trained >= config.init.sh_degree.min(SH_DEGREE_MAX)
+        && at.step < config.steps
+}
+
+/// A warning if the settings ask for a reduction that this run, of so many photos, is too short
+/// for.
+pub(super) fn never_due(
+    config: &TrainSettings,
+    run: RunSchedule,
+    photos: usize,
+) -> Option<Warning> {
+    let last = StepInfo {
+        step: config.steps.saturating_sub(1),
+        run,
+    };
+    let never = config.sh_reduction.is_some() && !is_due(config, &last, photos);
+    never.then_some(Warning::ShReductionNeverDue)
+}
+
 impl<M: SplatModel> Trainer<M> {
     /// Lowers the degrees of Gaussians after the step at which it is due, and not again.
     pub(super) fn reduce_sh_degrees(&mut self) -> Result<(), TrainError> {
-        let (step, steps) = (self.state.step, self.config.steps);
+        let step = self.state.step;
         let Some(settings) = self.config.sh_reduction else {
             return Ok(());
         };
@@ -34,19 +59,12 @@ impl<M: SplatModel> Trainer<M> {
             run: self.schedule,
         };
         let train = &self.capture.split.train;
-        // What was not trained yet is zero and would be taken for needless.
-        let trained = sh_schedule::degree(&self.config, &at, train.len());
-        let is_due = step as f64 >= settings.at * steps as f64
-            && trained >= self.config.init.sh_degree.min(SH_DEGREE_MAX)
-            && step < steps;
+        let is_due = is_due(&self.config, &at, train.len());
         if !is_due || self.state.history.sh_reduction.is_some() {
             return Ok(());
         }
         let _span = trace_span!("degrees").entered();
-        let render = RenderSettings {
-            sh_degree: SH_DEGREE_MAX,
-            ..self.render_settings(&at)
-        };
+        let render = self.render_settings(&at);
         let origin = self.state.model.origin();
         let (capture, hooks, device) = (&self.capture, &self.state.hooks, &self.device);
         let cameras = train.iter().enumerate().map(|(training_index, index)| {

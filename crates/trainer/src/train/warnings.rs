@@ -82,6 +82,9 @@ pub enum Warning {
         /// Their names.
         views: Vec<String>,
     },
+    /// [`TrainSettings::sh_reduction`](super::TrainSettings::sh_reduction) asks for a reduction
+    /// that the run is too short for.
+    ShReductionNeverDue,
     /// No training views have enough keypoints in common to adjust their poses to.
     TooFewKeypoints,
     /// The keypoints disagree with the photos and cameras.
@@ -234,6 +237,10 @@ impl fmt::Display for Warning {
                 f,
                 "{}: the photo has other pixels than the one that the run was begun with; it goes on with those there are now",
                 Names(views)
+            ),
+            Self::ShReductionNeverDue => write!(
+                f,
+                "`sh_reduction` lowers no degrees: the run ends before the highest degree is trained, or before the share `sh_reduction.at` of it; train for more steps, or leave it out"
             ),
             Self::TooFewKeypoints => write!(
                 f,

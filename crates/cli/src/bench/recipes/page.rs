@@ -176,6 +176,7 @@ mod tests {
             captures: vec![Subject {
                 name: "a|b".to_owned(),
                 folder: "a|b".into(),
+                contents: String::new(),
             }],
             ..Plan::new(recipes.into(), 2, Some(100), photos).unwrap()
         };

@@ -1,6 +1,5 @@
 //! The runs to make, in turns, and which of them are missing.
 
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use super::pictures;
@@ -9,7 +8,7 @@ use crate::photos::{self, PhotoArgs};
 use crate::report::refuse_inputs;
 use crate::text::read_config;
 use crate::{Failure, GlobalArgs};
-use splat_data::{Capture, CaptureSettings};
+use splat_data::{Capture, CaptureSettings, View};
 use splat_trainer::{RECIPES, Recipe, TrainSettings};
 
 /// A recipe, or the settings of a file.
@@ -78,6 +77,16 @@ pub(super) struct Plan {
 pub(super) struct Subject {
     pub name: String,
     pub folder: PathBuf,
+    /// Digest of what it has beside its pixels, see [`contents`].
+    pub contents: String,
+}
+
+/// Digest of the photos' folder and of the views: names, cameras, and which are held out.
+fn contents(capture: &Capture) -> String {
+    let view = |view: &View| format!("{} {:?}", view.name, view.camera());
+    let views: Vec<String> = capture.views.iter().map(view).collect();
+    let photos = capture.photos.canonicalize();
+    digest(&format!("{photos:?} {views:?} {:?}", capture.split.test))
 }
 
 /// A run to make.
@@ -86,8 +95,8 @@ pub(super) struct Run {
     pub capture: usize,
     pub recipe: Named,
     pub key: Key,
-    /// Digest of the program's version, the folder of the capture, the choice of its views and all
-    /// settings: a result is of this run only if it has the same.
+    /// Digest of the program's version, the capture's folder and contents, and all settings: a
+    /// result is of this run only if it has the same.
     digest: String,
 }
 
@@ -152,6 +161,7 @@ impl Plan {
             self.captures.push(Subject {
                 name,
                 folder: folder.clone(),
+                contents: contents(&capture),
             });
         }
         Ok(())
@@ -168,16 +178,6 @@ impl Plan {
         Ok(photos::load(folder, &self.reading(), global)?)
     }
 
-    /// What tells the views and photos of a run from those of others, beside their size.
-    fn views(&self) -> Vec<OsString> {
-        let chosen = PhotoArgs {
-            downscale: None,
-            photo_memory: None,
-            ..self.photos.clone()
-        };
-        chosen.words()
-    }
-
     /// All runs, in turns: with each seed, each recipe once on each capture.
     pub(super) fn runs(&self) -> Vec<Run> {
         let mut runs = Vec::new();
@@ -188,9 +188,9 @@ impl Plan {
                     let folder = subject.folder.canonicalize();
                     let folder = folder.unwrap_or_else(|_| subject.folder.clone());
                     let (version, folder) = (env!("CARGO_PKG_VERSION"), folder.display());
-                    let views = self.views();
+                    let contents = &subject.contents;
                     runs.push(Run {
-                        digest: digest(&format!("{version} {folder} {settings:?} {views:?}")),
+                        digest: digest(&format!("{version} {folder} {settings:?} {contents}")),
                         capture,
                         recipe: recipe.clone(),
                         key: Key {
@@ -272,6 +272,8 @@ fn settings(recipe: &Named, steps: Option<usize>, downscale: u32, seed: u64) -> 
 
 #[cfg(test)]
 mod tests {
+    use splat_data::SplitRule;
+
     use super::super::row::example;
     use super::*;
 
@@ -281,6 +283,7 @@ mod tests {
         let subject = |name: &str| Subject {
             name: name.to_owned(),
             folder: name.into(),
+            contents: String::new(),
         };
         let photos = PhotoArgs {
             downscale: Some(4),
@@ -382,16 +385,27 @@ mod tests {
 
     #[test]
     fn runs_with_other_views_are_others() {
-        let rows = vec![row("a", "mcmc", 0)];
-        let missing = |change: fn(&mut PhotoArgs)| {
-            let mut plan = plan();
-            change(&mut plan.photos);
-            plan.missing(&rows).len()
+        let rows = vec![row("a", "mcmc", 0), row("b", "mcmc", 0)];
+        let mut plan = plan();
+        assert_eq!(plan.missing(&rows).len(), 6);
+        plan.captures[0].contents = "other views".to_owned();
+        assert_eq!(plan.missing(&rows).len(), 7);
+
+        let folder = concat!(env!("CARGO_MANIFEST_DIR"), "/../../examples/data/saharov");
+        let read = |settings: CaptureSettings| {
+            let settings = settings.with_downscale(16).with_memory(0);
+            Capture::load(folder, &settings).unwrap()
         };
-        assert_eq!(missing(|_| {}), 7);
-        assert_eq!(missing(|photos| photos.photo_memory = Some(100)), 7);
-        assert_eq!(missing(|photos| photos.hold_out = Some("3".into())), 8);
-        assert_eq!(missing(|photos| photos.images = Some("images_2".into())), 8);
+        let usual = read(CaptureSettings::new());
+        let split = read(CaptureSettings::new().with_split(SplitRule::Every(5)));
+        let mut moved = usual.clone();
+        moved.views[3].viewmat[0][3] += 1e-3;
+        let mut elsewhere = usual.clone();
+        elsewhere.photos = folder.into();
+        for other in [split, moved, elsewhere] {
+            assert_ne!(contents(&other), contents(&usual));
+        }
+        assert_eq!(contents(&usual), contents(&usual.clone()));
     }
 
     #[test]

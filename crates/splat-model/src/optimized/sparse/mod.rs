@@ -182,9 +182,10 @@ impl<M: SplatModel> SparseOptimized<M> {
     }
 
     /// True if steps of some rows are the same as steps of all: the model says that its Gaussians
-    /// are independent ([`SplatModel::is_row_wise`]; those of different degrees of spherical
-    /// harmonics are not in rows of their own alone), every field of theirs is stepped by
-    /// [`SplatAdam`](crate::optimizer::SplatAdam), and no gradient waits for another step.
+    /// are independent ([`SplatModel::is_row_wise`], which those of different degrees of spherical
+    /// harmonics are not here, since one has several rows of a field), every field of theirs is
+    /// stepped by [`SplatAdam`](crate::optimizer::SplatAdam), and no gradient waits for another
+    /// step.
     pub fn can_be_sparse(&self) -> bool {
         let rows: Vec<&Field> = self.row_fields().collect();
         let has = |name: &&str| rows.iter().any(|field| field.name == **name);

@@ -117,6 +117,32 @@ fn gaussians_of_one_colour_train_fourteen_numbers() {
     assert!(!found.contains_key("sh_rest"));
 }
 
+/// The highest degree comes after three passes over the photos, or the share is beyond the last
+/// step.
+#[test]
+fn a_run_that_is_too_short_for_a_reduction_says_so() {
+    let warned = |steps: usize, at: f64| {
+        let warnings = Arc::new(Mutex::new(Vec::new()));
+        let said = warnings.clone();
+        let settings = settings(StrategyKind::Adc)
+            .with_steps(steps)
+            .with_sh_reduction(ShReductionSettings::new().with_at(at));
+        let trainer = builder().settings(settings);
+        let trainer = trainer.on_warning(move |warning| said.lock().unwrap().push(warning.clone()));
+        let trained = trainer.build().unwrap().run().unwrap();
+        let warned = warnings
+            .lock()
+            .unwrap()
+            .contains(&Warning::ShReductionNeverDue);
+        assert_eq!(trained.history.sh_reduction.is_none(), warned);
+        warned
+    };
+    assert_eq!(
+        [(20, 0.0), (100, 0.5), (100, 0.999)].map(|(steps, at)| warned(steps, at)),
+        [true, false, true]
+    );
+}
+
 /// Nothing of it is in a run that does not ask for it.
 #[test]
 fn a_run_without_a_reduction_has_gaussians_of_one_degree() {
