@@ -287,7 +287,7 @@ fn sh_colors_forward<R: Float>(
     }
 }
 
-/// Colours [C, N, 3]. The degree is limited to [`SH_DEGREE_MAX`](splat_core::SH_DEGREE_MAX) and to
+/// Colours [C, N, 3]. The degree is limited to [`SH_DEGREE_MAX`] and to
 /// the stored coefficients.
 pub fn sh_colors(client: &Client, inputs: &ShColorInputs, settings: ShColorSettings) -> Buffer {
     let (gaussians, cameras) = (inputs.gaussians(), inputs.cameras());
