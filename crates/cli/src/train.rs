@@ -15,8 +15,9 @@ use super::device::ChosenDevice;
 use super::photos::{self, PhotoArgs};
 use super::{Failure, GlobalArgs, device, eval, interrupt, print, text};
 use crate::report::progress::Progress;
+use crate::report::refuse_inputs;
 pub(super) use results::CAMERAS;
-use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
+use results::{CAMERAS, CHECKPOINT, CONFIG, RunFolder, picture_names};
 use resume::Interrupted;
 use splat_data::{Capture, CaptureSettings};
 use splat_trainer::{
@@ -224,6 +225,10 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     }
     let out = args.out(resumed.as_ref(), &capture);
     resume::refuse_unfinished(&out, resumed.as_ref().map(|run| &*run.path))?;
+    // Cameras of an earlier run in the folder go with its scene.
+    let read = [Some(&args.capture), args.photos.cameras.as_ref()];
+    let read = read.into_iter().flatten().map(PathBuf::as_path);
+    refuse_inputs([out.join(CAMERAS)], read)?;
     let chosen = device::open(global)?;
     global.say(format_args!(
         "{}: {} photos to train on, {} held out, {} points",

@@ -183,7 +183,7 @@ fn no_photo_is_replaced_by_a_picture() {
     ] {
         let line = refusal(&arguments);
         assert!(
-            line.contains("0.png") && line.contains("the command reads this file"),
+            line.contains("0.png") && line.contains("the command reads it"),
             "{line}"
         );
         assert_eq!(bytes("0.png"), before);

@@ -207,6 +207,19 @@ fn cameras_are_refined_and_written() {
     let refined = ["--steps", "5", "--refine-intrinsics"];
     succeed(&train(&capture, &out, &refined));
     assert!(cameras.join("cameras.bin").exists());
+    // They are not replaced by the run that reads them.
+    let own = train(
+        &capture,
+        &out,
+        &["--steps", "5", "--cameras", text(&cameras)],
+    );
+    assert_eq!(own.status.code(), Some(2));
+    let errors = String::from_utf8_lossy(&own.stderr).into_owned();
+    assert!(errors.contains("cameras: the command reads it"), "{errors}");
+    assert!(cameras.join("cameras.bin").exists());
+    let other = folder.path().join("other");
+    let elsewhere = ["--steps", "5", "--cameras", text(&cameras)];
+    succeed(&train(&capture, &other, &elsewhere));
     succeed(&train(&capture, &out, &["--steps", "5"]));
     assert!(!cameras.join("cameras.bin").exists());
     // Undistorted photos are not replaced.

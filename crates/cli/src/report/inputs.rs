@@ -43,7 +43,7 @@ mod tests {
         for output in [input.clone(), round_about] {
             let message = check(output).unwrap_err().to_string();
             assert!(
-                message.contains("in.png: the command reads this file"),
+                message.contains("in.png: the command reads it"),
                 "{message}"
             );
         }

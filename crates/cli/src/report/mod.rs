@@ -27,7 +27,7 @@ pub enum ReportError {
     #[error(transparent)]
     Write(#[from] WriteError),
     /// The file is an input of the command.
-    #[error("{}: the command reads this file, and would replace it; write to another place", path.display())]
+    #[error("{}: the command reads it, and would replace it; write to another place", path.display())]
     Input {
         /// The file.
         path: PathBuf,

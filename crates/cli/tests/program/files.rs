@@ -88,13 +88,13 @@ fn files_that_cannot_be_written_are_refused_before_the_work() {
         "{line}"
     );
     let line = refused(&["convert", text(&scene), text(&scene)]);
-    assert!(line.contains("reads this file"), "{line}");
+    assert!(line.contains("reads it"), "{line}");
     let compact = |more: &[&str]| {
         let given = ["compact", text(&scene), "--capture", text(&capture)];
         refused(&[&given, more].concat())
     };
     let line = compact(&["--out", text(&scene), "--downscale", "8"]);
-    assert!(line.contains("reads this file"), "{line}");
+    assert!(line.contains("reads it"), "{line}");
     let file = folder.path().join("x.spz");
     let output = splat(&[
         "compact",
