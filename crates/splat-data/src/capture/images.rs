@@ -75,7 +75,9 @@ pub(super) fn load(
         })
         .collect();
     let loaded = loaded.into_iter().collect::<Result<Vec<_>, _>>()?;
-    warnings.extend(rescaled(&loaded));
+    let rescaled =
+        (loaded.iter()).filter_map(|loaded| Some((&*loaded.view.name, loaded.rescaled?)));
+    warnings.extend(CaptureWarning::rescaled(rescaled));
     let found = |kind: fn(&Loaded) -> bool| {
         let mut odd = loaded.iter().filter(|loaded| kind(loaded));
         let first = odd.next()?.view.name.clone();
@@ -95,17 +97,4 @@ pub(super) fn load(
         warnings.extend(folders::unregistered(root, folder, model));
     }
     Ok(loaded.into_iter().map(|loaded| loaded.view).collect())
-}
-
-fn rescaled(loaded: &[Loaded]) -> Option<CaptureWarning> {
-    let mut odd = loaded
-        .iter()
-        .filter_map(|loaded| Some((&loaded.view.name, loaded.rescaled?)));
-    let (first, [photo, camera]) = odd.next()?;
-    Some(CaptureWarning::RescaledPhotos {
-        count: 1 + odd.count(),
-        first: first.clone(),
-        photo,
-        camera,
-    })
 }

@@ -40,24 +40,14 @@ pub(super) fn take(
                 ),
             ));
         };
-        let size = camera.intrinsics.size();
-        rescaled.extend(
-            size.filter(|size| *size != photo)
-                .map(|camera| (view.name.clone(), photo, camera)),
-        );
+        let size = camera.intrinsics.size().filter(|size| *size != photo);
+        rescaled.extend(size.map(|camera| (view.name.clone(), [photo, camera])));
         view.intrinsics = intrinsics;
         view.lens = camera.lens;
         view.viewmat = image.viewmat;
     }
-    let count = rescaled.len();
-    if let Some((first, photo, camera)) = rescaled.into_iter().next() {
-        warnings.push(CaptureWarning::RescaledPhotos {
-            count,
-            first,
-            photo,
-            camera,
-        });
-    }
+    let rescaled = rescaled.iter().map(|(name, sizes)| (&**name, *sizes));
+    warnings.extend(CaptureWarning::rescaled(rescaled));
     Ok(())
 }
 

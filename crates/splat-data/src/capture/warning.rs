@@ -223,6 +223,21 @@ impl fmt::Display for CaptureWarning {
 }
 
 impl CaptureWarning {
+    /// A warning of photos whose size is not their camera's, if there are any: their names, and
+    /// the sizes of photo and camera.
+    pub(super) fn rescaled<'a>(
+        photos: impl IntoIterator<Item = (&'a str, [[u32; 2]; 2])>,
+    ) -> Option<Self> {
+        let mut photos = photos.into_iter();
+        let (first, [photo, camera]) = photos.next()?;
+        Some(Self::RescaledPhotos {
+            count: 1 + photos.count(),
+            first: first.to_owned(),
+            photo,
+            camera,
+        })
+    }
+
     /// Those about cameras, points and the split.
     fn of_the_model(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
