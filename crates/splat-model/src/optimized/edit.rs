@@ -23,12 +23,12 @@ impl<M: Module> Optimized<M> {
     /// wrong width, leaves no Gaussian, or is of rows that follow the Gaussians. The model is then
     /// unchanged.
     pub fn edit_rows(&mut self, edit: &RowEdit) -> Result<(), OpError> {
-        self.check_edit(edit)?;
-        let owned = match edit.row_set() {
-            GAUSSIANS => self.owned_rows(),
+        let owned = self.owned_rows();
+        self.check_edit(edit, &owned)?;
+        let owned: Vec<_> = match edit.row_set() {
+            GAUSSIANS => owned.iter().map(|rows| rows.follow(edit)).collect(),
             _ => Vec::new(),
         };
-        let owned: Vec<_> = owned.iter().map(|rows| rows.follow(edit)).collect();
         for (_, after) in &owned {
             if i32::try_from(after.rows()).is_err() {
                 return Err(wrong(format!(
@@ -104,9 +104,8 @@ impl<M: Module> Optimized<M> {
     }
 
     /// Checks every row and width of an edit before anything changes.
-    fn check_edit(&self, edit: &RowEdit) -> Result<(), OpError> {
+    fn check_edit(&self, edit: &RowEdit, owned: &[OwnedRows]) -> Result<(), OpError> {
         let wrong = |what: String| Err(wrong(what));
-        let owned = self.owned_rows();
         if owned.iter().any(|rows| rows.row_set() == edit.row_set()) {
             return wrong(format!(
                 "rows of the set {} belong to the Gaussians and follow them; edit those",
