@@ -25,6 +25,21 @@ fn single(half: u16) -> f32 {
     }
 }
 
+/// Gaussians with 15 coefficients each, the values, and random colours, means and centres.
+fn inputs(client: &Client, rng: &mut Pcg32, rest: &[f32], cameras: usize) -> ShColorInputs {
+    let n = rest.len() / 45;
+    let mut random = |rows: usize| upload(client, &uniform(rng, rows * 3, -1.0, 1.0));
+    ShColorInputs {
+        sh0: random(n),
+        sh_rest: Some(ShRest::Exact(upload(client, rest))),
+        stored: 15,
+        starts: None,
+        means: random(n),
+        centers: random(cameras),
+        seen: None,
+    }
+}
+
 /// Colours, and the gradients of sh0, means and centres, as bits.
 fn bits(client: &Client, inputs: &ShColorInputs, grad: &Buffer, degree: usize) -> Vec<Vec<u32>> {
     let read = |buffer: &Buffer| -> Vec<u32> {
@@ -83,15 +98,7 @@ fn halves_are_read_as_the_numbers_they_stand_for() {
     let bytes: Vec<u8> = halves.iter().flat_map(|half| half.to_le_bytes()).collect();
     let handle = client.create_from_slice(&bytes);
     assert!(HalfBuffer::new(handle.clone(), halves.len() + 1).is_err());
-    let exact = ShColorInputs {
-        sh0: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
-        sh_rest: Some(ShRest::Exact(upload(&client, &values))),
-        stored: 15,
-        starts: None,
-        means: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
-        centers: upload(&client, &uniform(&mut rng, cameras * 3, -1.0, 1.0)),
-        seen: None,
-    };
+    let exact = inputs(&client, &mut rng, &values, cameras);
     let half = ShColorInputs {
         sh_rest: Some(ShRest::Half(HalfBuffer::new(handle, halves.len()).unwrap())),
         ..exact.clone()
@@ -127,15 +134,7 @@ fn gaussians_of_different_degrees_are_as_with_zeros_in_place() {
         values[of_gaussian + kept..of_gaussian + 45].fill(0.0);
         starts.push((own.len() / 3) as u32);
     }
-    let uniform_inputs = ShColorInputs {
-        sh0: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
-        sh_rest: Some(ShRest::Exact(upload(&client, &values))),
-        stored: 15,
-        starts: None,
-        means: upload(&client, &uniform(&mut rng, n * 3, -1.0, 1.0)),
-        centers: upload(&client, &uniform(&mut rng, cameras * 3, -1.0, 1.0)),
-        seen: None,
-    };
+    let uniform_inputs = inputs(&client, &mut rng, &values, cameras);
     let ragged = ShColorInputs {
         sh_rest: Some(ShRest::Exact(upload(&client, &own))),
         stored: 1,

@@ -577,3 +577,42 @@ fn results_of_two_runs_are_not_mixed_up() {
     assert!(said.contains("4 picture(s) were there before"), "{said}");
     assert!(!out.join("metrics.json").exists());
 }
+
+#[test]
+fn lowered_degrees_are_reported_and_the_scene_has_zeros() {
+    let folder = TempDir::new().unwrap();
+    let capture = example(folder.path());
+    let config = folder.path().join("lower.toml");
+    // Every colour varies by less.
+    fs::write(&config, "[sh_reduction]\nstd = 1e9\n").unwrap();
+    let out = folder.path().join("out");
+    let trained = train(
+        &capture,
+        &out,
+        &["--steps", "100", "--config", text(&config)],
+    );
+    succeed(&trained);
+    let said = String::from_utf8_lossy(&trained.stdout).into_owned();
+    assert!(said.contains("spherical harmonics"), "{said}");
+    let reduced = &metrics(&out)["sh_reduction"];
+    assert!(reduced["step"].as_u64().unwrap() >= 50, "{reduced}");
+    let lowered: Vec<u64> = serde_json::from_value(reduced["gaussians"].clone()).unwrap();
+    assert!(lowered[0] > 0 && lowered[1..] == [0, 0, 0], "{reduced}");
+    let kept = fs::read_to_string(out.join("config.toml")).unwrap();
+    assert!(kept.contains("[sh_reduction]"), "{kept}");
+
+    let scene = out.join("scene.ply");
+    let json = folder.path().join("scores.json");
+    let scored = splat(
+        &[
+            &["eval", text(&capture), text(&scene)][..],
+            &["--downscale", "4", "--json", text(&json)],
+        ]
+        .concat(),
+    );
+    succeed(&scored);
+    let scores: serde_json::Value =
+        serde_json::from_str(&fs::read_to_string(json).unwrap()).unwrap();
+    let [found, expected] = [&scores, &metrics(&out)].map(|of| of["psnr"].as_f64().unwrap());
+    assert!((found - expected).abs() < 1e-3, "{found} for {expected}");
+}

@@ -21,6 +21,11 @@ fn settings(strategy: StrategyKind) -> TrainSettings {
     settings
 }
 
+fn whole(settings: &TrainSettings) -> Trained<Gaussians> {
+    let trainer = builder().settings(settings.clone()).build();
+    trainer.unwrap().run().unwrap()
+}
+
 fn stopped_at(settings: &TrainSettings, stop: usize) -> Trained<Gaussians> {
     let flag = Arc::new(AtomicBool::new(false));
     let raise = flag.clone();
@@ -32,12 +37,7 @@ fn stopped_at(settings: &TrainSettings, stop: usize) -> Trained<Gaussians> {
 }
 
 fn goes_on_as_if_it_had_not_stopped(settings: &TrainSettings) {
-    let whole = builder()
-        .settings(settings.clone())
-        .build()
-        .unwrap()
-        .run()
-        .unwrap();
+    let whole = whole(settings);
     let reduced = whole.history.sh_reduction.unwrap();
     assert!(reduced.step >= 120 && reduced.step < 180, "{reduced}");
     let lowered = reduced.gaussians;
@@ -86,7 +86,7 @@ fn improved_gs_goes_on_with_fewer_harmonics() {
 #[test]
 fn steps_of_seen_rows_end_with_the_reduction() {
     let settings = settings(StrategyKind::Adc).with_sparse_share(1.0);
-    let trained = builder().settings(settings).build().unwrap().run().unwrap();
+    let trained = whole(&settings);
     assert!(trained.history.sh_reduction.is_some() && trained.steps == 240);
 }
 
@@ -148,12 +148,7 @@ fn a_run_that_is_too_short_for_a_reduction_says_so() {
 fn a_run_without_a_reduction_has_gaussians_of_one_degree() {
     let mut settings = settings(StrategyKind::Adc).with_steps(60);
     settings.sh_reduction = None;
-    let trained = builder()
-        .settings(settings.clone())
-        .build()
-        .unwrap()
-        .run()
-        .unwrap();
+    let trained = whole(&settings);
     assert!(trained.model.sh_starts.is_none() && trained.history.sh_reduction.is_none());
     // As another run it is refused.
     let checkpoint = trained.checkpoint().unwrap();
