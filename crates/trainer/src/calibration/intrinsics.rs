@@ -125,7 +125,7 @@ struct Correction {
 ///
 /// A pinhole gets the coefficients k1, k2, p1, p2 of [`CameraModel::OpenCv`], zero at first; lenses
 /// with distortion keep their model. Held-out views have the refined cameras too. The domains of
-/// the lenses follow their coefficients every 100 steps.
+/// the lenses follow their coefficients every 20 steps, and at the end of the run.
 pub struct RefineIntrinsics {
     corrections: Optimized<Corrections>,
     cameras: Vec<Physical>,
