@@ -246,12 +246,13 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     let config_text = config_text(&out, args, global, &chosen, &config, &changes)?;
     let fresh = checkpoint.is_none();
     let capture = Arc::new(capture);
-    let progress = Progress::new(
-        config.steps as u64,
-        checkpoint.as_ref().map_or(0, Checkpoint::step) as u64,
-        global.quiet,
-    );
-    let progress = Arc::new(Mutex::new(progress));
+    let start = checkpoint.as_ref().map_or(0, Checkpoint::step);
+    let training = || Progress::new(config.steps as u64, start as u64, global.quiet);
+    let adjusts = fresh && config.calibration.poses && config.calibration.bundle_adjustment;
+    let progress = Arc::new(Mutex::new(match adjusts {
+        true => Progress::new(100, 0, global.quiet),
+        false => training(),
+    }));
     let mut trainer = Trainer::builder(capture.clone())
         .settings(config.clone())
         .device(chosen.device.clone())
@@ -264,7 +265,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     let trainer = trainer.autosave(Duration::from_secs(args.autosave), move |checkpoint| {
         checkpoint.save(&file)
     });
-    if config.calibration.poses && config.calibration.bundle_adjustment {
+    if adjusts {
         global.say(match capture.observations.is_empty() {
             true => "looking for keypoints that photos share, to adjust the poses to them",
             false => "adjusting the poses to the keypoints",
@@ -275,7 +276,12 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
         TrainError::Interrupted => Failure::Interrupted(error.to_string()),
         error => error.into(),
     })?;
-    if let Some(adjusted) = trainer.bundle_adjustment().filter(|_| fresh) {
+    if adjusts {
+        let mut progress = lock(&progress);
+        progress.finish();
+        *progress = training();
+    }
+    if let Some(adjusted) = trainer.bundle_adjustment() {
         global.say(format_args!(
             "{} of {} poses adjusted to {} keypoints{}: {:.2} pixels off in the median, {:.2} before",
             adjusted.views,
@@ -355,8 +361,12 @@ fn lock(progress: &Mutex<Progress>) -> MutexGuard<'_, Progress> {
 
 /// Lets progress and warnings be seen.
 fn shown(trainer: TrainerBuilder, progress: &Arc<Mutex<Progress>>) -> TrainerBuilder {
-    let [shown, noted] = [progress, progress].map(Arc::clone);
+    let [shown, noted, adjusting] = [progress, progress, progress].map(Arc::clone);
     trainer
+        .on_adjustment(move |share| {
+            let percent = (100.0 * share) as u64;
+            lock(&adjusting).update(percent, || "% of the adjustment of poses".to_owned());
+        })
         .on_warning(move |warning| lock(&noted).note(&format!("warning: {warning}")))
         .on_progress(move |state| {
             lock(&shown).update(state.step as u64, || {

@@ -15,8 +15,8 @@ mod settings;
 
 pub(crate) use align::Aligning;
 pub use align::{AlignedScores, align_pose};
-pub(crate) use bundle::adjust_bundle_unless;
 pub use bundle::{BundleAdjustment, adjust_bundle};
+pub(crate) use bundle::{Watched, adjust_bundle_watched};
 pub use intrinsics::RefineIntrinsics;
 pub use poses::RefinePoses;
 pub use schedule::CalibrationSchedule;

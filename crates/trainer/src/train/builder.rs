@@ -25,7 +25,8 @@ use super::{
     TrainSettings, Warning, resolution_schedule, sh_reduction, views,
 };
 use crate::calibration::{
-    BundleAdjustment, CalibrationSchedule, RefineIntrinsics, RefinePoses, adjust_bundle_unless,
+    BundleAdjustment, CalibrationSchedule, RefineIntrinsics, RefinePoses, Watched,
+    adjust_bundle_watched,
 };
 use crate::hooks::{Hook, Hooks};
 
@@ -179,6 +180,15 @@ impl<M: SplatModel> TrainerBuilder<M> {
     /// Called after every step.
     pub fn on_progress(mut self, callback: impl FnMut(Progress) + Send + 'static) -> Self {
         self.watch.on_progress = Box::new(callback);
+        self
+    }
+
+    /// Called by [`build`](Self::build), from several threads, with the share of the adjustment of
+    /// poses ([`CalibrationSettings::bundle_adjustment`]) that is done, from 0 to 1.
+    ///
+    /// [`CalibrationSettings::bundle_adjustment`]: crate::calibration::CalibrationSettings
+    pub fn on_adjustment(mut self, callback: impl Fn(f64) + Send + Sync + 'static) -> Self {
+        self.watch.on_adjustment = Box::new(callback);
         self
     }
 
@@ -340,7 +350,8 @@ fn adjusted(
     if !(settings.poses && settings.bundle_adjustment) {
         return Ok(None);
     }
-    let adjusted = adjust_bundle_unless(&watch.interrupt, capture)?;
+    let watched = Watched::whole(&watch.interrupt, &watch.on_adjustment);
+    let adjusted = adjust_bundle_watched(watched, capture)?;
     if watch.interrupt.load(Ordering::Relaxed) {
         return Err(TrainError::Interrupted);
     }

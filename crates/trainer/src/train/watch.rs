@@ -16,6 +16,8 @@ pub(super) struct Watch {
     pub(super) commands: Commands,
     pub(super) evaluate_every: Option<usize>,
     pub(super) autosave: Option<Autosave>,
+    /// Takes the share of the adjustment of poses that is done.
+    pub(super) on_adjustment: Box<dyn Fn(f64) + Send + Sync>,
     pub(super) on_progress: Box<dyn FnMut(Progress) + Send>,
     pub(super) on_warning: Box<dyn FnMut(&Warning) + Send>,
 }
@@ -37,6 +39,7 @@ impl Default for Watch {
             commands: Commands::new(None),
             evaluate_every: None,
             autosave: None,
+            on_adjustment: Box::new(|_| {}),
             on_progress: Box::new(|_| {}),
             on_warning: Box::new(|_| {}),
         }

@@ -4,7 +4,7 @@
 //! patch around a corner is turned and scaled there. The search is by normalised correlation, in
 //! photos of a quarter of the size and then as they are.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use glam::{DMat4, DVec3};
 use rayon::prelude::*;
@@ -12,6 +12,7 @@ use splat_data::{BoundedLens, Camera, CaptureError, View};
 
 use super::picture::{Patch, Picture, UPRIGHT, Warp};
 use super::problem::Sight;
+use super::watched::Watched;
 use crate::quantile::median;
 
 /// Photos are searched at this length of their longer side, or up to twice it.
@@ -88,12 +89,17 @@ impl Photos {
     }
 
     /// Looks for the corners of every photo in its neighbours, up to a share of the longer side
-    /// away from where the poses and these points have them. Fewer photos are searched if the flag
-    /// becomes true.
-    pub fn matched(&self, interrupt: &AtomicBool, points: &[DVec3], reach: f64) -> Matched {
-        let of_photo = |index: usize| match interrupt.load(Ordering::Relaxed) {
-            true => vec![],
-            false => self.matches_of(index, points, reach),
+    /// away from where the poses and these points have them. Fewer photos are searched if it is
+    /// interrupted.
+    pub fn matched(&self, watched: Watched<'_>, points: &[DVec3], reach: f64) -> Matched {
+        let done = AtomicUsize::new(0);
+        let of_photo = |index: usize| {
+            if watched.is_interrupted() {
+                return vec![];
+            }
+            let found = self.matches_of(index, points, reach);
+            watched.done(1 + done.fetch_add(1, Ordering::Relaxed), self.0.len());
+            found
         };
         let found: Vec<_> = (0..self.0.len()).into_par_iter().map(of_photo).collect();
         let mut matched = Matched {

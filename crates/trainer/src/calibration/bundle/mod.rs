@@ -13,14 +13,16 @@ mod matching;
 mod normal;
 mod picture;
 mod problem;
+mod watched;
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::AtomicBool;
 
 use glam::{DMat4, DVec3};
 use splat_data::{Capture, CaptureError, View};
 
 use matching::Photos;
 use problem::{Cost, Problem, Unknowns};
+pub(crate) use watched::Watched;
 
 /// Fewest keypoints that fix a pose.
 const FEWEST_KEYPOINTS: usize = 12;
@@ -98,12 +100,12 @@ pub struct BundleAdjustment {
 /// # Errors
 /// When a photo on the disk cannot be read.
 pub fn adjust_bundle(capture: &Capture) -> Result<Option<BundleAdjustment>, CaptureError> {
-    adjust_bundle_unless(&AtomicBool::new(false), capture)
+    adjust_bundle_watched(Watched::whole(&AtomicBool::new(false), &|_| {}), capture)
 }
 
-/// [`adjust_bundle`], given up soon after a flag becomes true; the result is then of no use.
-pub(crate) fn adjust_bundle_unless(
-    interrupt: &AtomicBool,
+/// [`adjust_bundle`] with its progress. If it is interrupted, the result is of no use.
+pub(crate) fn adjust_bundle_watched(
+    watched: Watched<'_>,
     capture: &Capture,
 ) -> Result<Option<BundleAdjustment>, CaptureError> {
     let views: Vec<&View> = capture.train_views().collect();
@@ -112,22 +114,24 @@ pub(crate) fn adjust_bundle_unless(
         viewmats: views.iter().map(|view| view.camera().viewmat).collect(),
         points: points.collect(),
     };
-    match capture.observations.is_empty() {
-        false => Ok(of_observations(interrupt, capture, &views, unknowns)),
-        true => of_corners(interrupt, &views, unknowns),
-    }
+    let adjusted = match capture.observations.is_empty() {
+        false => of_observations(watched, capture, &views, unknowns),
+        true => of_corners(watched, &views, unknowns)?,
+    };
+    watched.done(1, 1);
+    Ok(adjusted)
 }
 
 fn of_observations(
-    interrupt: &AtomicBool,
+    watched: Watched<'_>,
     capture: &Capture,
     views: &[&View],
     mut unknowns: Unknowns,
 ) -> Option<BundleAdjustment> {
     let problem = Problem::of_capture(capture, views)?;
     let before = problem.errors(&unknowns).median();
-    for free_points in [false, true] {
-        minimize(interrupt, &problem, &mut unknowns, free_points);
+    for (stage, free_points) in [false, true].into_iter().enumerate() {
+        minimize(watched.part(stage, 2), &problem, &mut unknowns, free_points);
     }
     Some(BundleAdjustment {
         points: unknowns.points.iter().map(DVec3::to_array).collect(),
@@ -136,16 +140,18 @@ fn of_observations(
 }
 
 fn of_corners(
-    interrupt: &AtomicBool,
+    watched: Watched<'_>,
     views: &[&View],
     start: Unknowns,
 ) -> Result<Option<BundleAdjustment>, CaptureError> {
     let mut photos = Photos::of(views)?;
     let mut viewmats = start.viewmats;
     let mut adjusted: Option<BundleAdjustment> = None;
-    for reach in REACHES {
+    for (round, reach) in REACHES.into_iter().enumerate() {
+        let watched = watched.part(round, REACHES.len());
+        let [search, solve] = [0, 1].map(|half| watched.part(half, 2));
         photos.place(&viewmats);
-        let matched = photos.matched(interrupt, &start.points, reach);
+        let matched = photos.matched(search, &start.points, reach);
         let mut unknowns = Unknowns {
             viewmats,
             points: matched.points,
@@ -154,11 +160,11 @@ fn of_corners(
             return Ok(None);
         };
         let before = problem.errors(&unknowns).median();
-        minimize(interrupt, &problem, &mut unknowns, true);
+        minimize(solve.part(0, 2), &problem, &mut unknowns, true);
         let Some(problem) = problem.without_outliers(&unknowns, OUTLIER) else {
             return Ok(None);
         };
-        minimize(interrupt, &problem, &mut unknowns, true);
+        minimize(solve.part(1, 2), &problem, &mut unknowns, true);
         let next = result(&problem, &unknowns, before, views);
         adjusted = Some(BundleAdjustment {
             // Wrong matches agree with the poses that follow from them, but new ones do not.
@@ -205,17 +211,18 @@ fn longer(views: &[&View]) -> f64 {
 /// Levenberg's and Marquardt's method: Gauss and Newton's step, whose diagonal grows while steps
 /// fail and shrinks while they succeed.
 fn minimize(
-    interrupt: &AtomicBool,
+    watched: Watched<'_>,
     problem: &Problem<'_>,
     unknowns: &mut Unknowns,
     free_points: bool,
 ) {
     let mut damping = 1e-4;
     let mut now = problem.linearized(unknowns);
-    for _ in 0..STEPS {
-        if interrupt.load(Ordering::Relaxed) {
+    for step in 0..STEPS {
+        if watched.is_interrupted() {
             return;
         }
+        watched.done(step, STEPS);
         // Huber's bound follows the errors, and is the same for both sides of a comparison.
         let cost = Cost {
             quadratic: QUADRATIC * now.errors.median(),

@@ -225,6 +225,29 @@ fn an_adjustment_that_is_interrupted_is_no_run() {
     }
 }
 
+/// By steps of the solver, and by photos where corners are looked for.
+#[test]
+fn the_adjustment_says_how_far_it_is() {
+    let calibration = CalibrationSettings::new().with_poses(true);
+    let settings = TrainSettings::new()
+        .with_steps(1)
+        .with_calibration(calibration);
+    let mut without = turned_with_keypoints();
+    without.observations.clear();
+    for (capture, fewest) in [(turned_with_keypoints(), 3), (without, 12)] {
+        let shares = Arc::new(Mutex::new(Vec::new()));
+        let seen = shares.clone();
+        let builder = builder_on(Arc::new(capture)).settings(settings.clone());
+        let builder = builder.on_adjustment(move |share| seen.lock().unwrap().push(share));
+        builder.build().unwrap();
+        let mut shares = shares.lock().unwrap();
+        assert_eq!(shares.last(), Some(&1.0));
+        assert!(shares.iter().all(|share| (0.0..=1.0).contains(share)));
+        shares.dedup();
+        assert!(shares.len() >= fewest, "{shares:?}");
+    }
+}
+
 #[test]
 fn keypoints_of_other_photos_are_left_aside() {
     let mut other = turned_with_keypoints();
