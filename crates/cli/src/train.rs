@@ -17,7 +17,7 @@ use super::{Failure, GlobalArgs, device, eval, interrupt, print, text};
 use crate::report::progress::Progress;
 use crate::report::refuse_inputs;
 pub(super) use results::CAMERAS;
-use results::{CAMERAS, CHECKPOINT, CONFIG, RunFolder, picture_names};
+use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
 use resume::Interrupted;
 use splat_data::{Capture, CaptureSettings};
 use splat_trainer::{
