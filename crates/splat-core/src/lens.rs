@@ -168,6 +168,37 @@ impl Lens {
         LensDomain { limit, clamp }
     }
 
+    /// The [`domain`](Self::domain) in which a lens that fits photos of this size is drawn. A
+    /// fisheye ends where its polynomial, which is of no use far outside of the photo, becomes
+    /// twice as steep as anywhere in it: with positive coefficients the footprint of a splat behind
+    /// the camera would grow with the eighth power of its angle, and cover the picture.
+    ///
+    /// ```
+    /// use splat_core::{ImageSize, Lens};
+    ///
+    /// let lens = Lens::OpenCvFisheye([0.0, 0.0, 0.0, 0.01]);
+    /// let (intrinsics, size) = ([150.0, 150.0, 68.0, 102.0], ImageSize { width: 136, height: 204 });
+    /// assert_eq!(lens.domain(intrinsics, size).limit, 175f64.to_radians());
+    /// let limit = lens.photo_domain(intrinsics, size).limit.to_degrees();
+    /// assert!(limit > 75.0 && limit < 90.0);
+    /// ```
+    pub fn photo_domain(&self, intrinsics: [f64; 4], size: ImageSize) -> LensDomain {
+        let domain = self.domain(intrinsics, size);
+        let Self::OpenCvFisheye(k) = self else {
+            return domain;
+        };
+        let bounded = self.bounded();
+        let angle = |[x, y, z]: [f64; 3]| x.hypot(y).atan2(z);
+        let farthest = corners(intrinsics, size)
+            .map(|corner| bounded.undistort(corner).map_or(domain.limit, angle))
+            .into_iter()
+            .fold(0.0, f64::max);
+        LensDomain {
+            limit: fisheye::steep(k, farthest, domain.limit),
+            ..domain
+        }
+    }
+
     /// [`BoundedLens::distort`] for one point.
     pub fn distort(&self, p: [f64; 3]) -> Option<[f64; 2]> {
         self.bounded().distort(p)

@@ -49,7 +49,7 @@ impl CameraTensors {
         };
         let lens = &camera.lens;
         let distortion = (!lens.coefficients().is_empty()).then(|| {
-            let domain = lens.domain(camera.intrinsics, camera.size);
+            let domain = lens.photo_domain(camera.intrinsics, camera.size);
             Distortion {
                 model: lens.model(),
                 coefficients: row(lens.coefficients()),

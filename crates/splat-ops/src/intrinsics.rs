@@ -144,7 +144,7 @@ fn domain(
     let domains: Vec<f64> = cameras
         .flat_map(|(coefficients, intrinsics)| {
             let lens = Lens::new(model, coefficients).unwrap_or_default();
-            let domain = lens.domain(std::array::from_fn(|i| intrinsics[i]), size);
+            let domain = lens.photo_domain(std::array::from_fn(|i| intrinsics[i]), size);
             [domain.limit, domain.clamp]
         })
         .collect();

@@ -60,6 +60,56 @@ fn limits_are_where_the_lens_folds_back() {
 }
 
 #[test]
+fn a_fisheye_is_drawn_until_it_is_steeper_than_in_the_photo() {
+    let limits = |k: [f64; 4]| {
+        let lens = Lens::OpenCvFisheye(k);
+        let [all, drawn] = [
+            lens.domain(INTRINSICS, SIZE),
+            lens.photo_domain(INTRINSICS, SIZE),
+        ];
+        (all.limit, drawn.limit)
+    };
+    // As steep everywhere, ever flatter, and with a fold.
+    for k in [
+        [0.0; 4],
+        [-0.01, 0.0, 0.0, 0.0],
+        [-0.1, 0.0, 0.0, 0.0],
+        [-0.02, 0.0, 0.0, -0.001],
+    ] {
+        let (all, drawn) = limits(k);
+        assert_eq!(drawn, all, "{k:?}");
+    }
+    // 1 + 9 k4 theta^8 is twice what it is at the corner.
+    let k4: f64 = 0.01;
+    let corner = (330.0f64 / 500.0).hypot(250.0 / 510.0);
+    let (all, drawn) = limits([0.0, 0.0, 0.0, k4]);
+    let slope = |theta: f64| 1.0 + 9.0 * k4 * theta.powi(8);
+    assert_eq!(all, 175f64.to_radians());
+    let angle = |distorted: f64| {
+        let bend = |theta: f64| theta + k4 * theta.powi(9);
+        (0..60).fold((0.0, 2.0), |(low, high), _| {
+            let middle = 0.5 * (low + high);
+            match bend(middle) < distorted {
+                true => (middle, high),
+                false => (low, middle),
+            }
+        })
+    };
+    let expected = 2.0 * slope(angle(corner).0);
+    assert!((slope(drawn) / expected - 1.0).abs() < 1e-9, "{drawn}");
+
+    // Nothing of the photo is lost, however steep it is there.
+    for k1 in [0.5, 2.0, 10.0] {
+        let lens = Lens::OpenCvFisheye([k1, 0.1, 0.0, 0.0]);
+        let (_, drawn) = limits([k1, 0.1, 0.0, 0.0]);
+        for corner in super::corners(INTRINSICS, SIZE) {
+            let [x, y, z] = lens.undistort(corner).expect("in the domain");
+            assert!(x.hypot(y).atan2(z) < drawn, "{k1}");
+        }
+    }
+}
+
+#[test]
 fn the_clamp_reaches_beyond_the_corners_and_stays_inside_of_the_limit() {
     let domain = Lens::OpenCv([0.0; 8]).domain(INTRINSICS, SIZE);
     let corner = (330.0f64 / 500.0).hypot(250.0 / 510.0);
@@ -96,6 +146,8 @@ fn no_coefficients_cause_a_panic() {
             ] {
                 lens.domain(INTRINSICS, SIZE);
                 lens.domain([value, 1.0, value, 0.0], SIZE);
+                lens.photo_domain(INTRINSICS, SIZE);
+                lens.photo_domain([value, 1.0, value, 0.0], SIZE);
                 lens.distort([0.3, 0.1, 1.0]);
                 lens.undistort([0.3, value]);
             }

@@ -213,7 +213,7 @@ impl RefineIntrinsics {
             self.cameras.iter().zip(&corrections).zip(&mut self.domains)
         {
             let camera = physical.corrected(&physical.camera, correction);
-            let found = camera.lens.domain(camera.intrinsics, camera.size);
+            let found = camera.lens.photo_domain(camera.intrinsics, camera.size);
             // A step too far is no reason to lose the domain.
             if found.limit.is_finite() && found.limit > 0.0 {
                 *domain = [found.limit, found.clamp];

@@ -275,7 +275,7 @@ fn bent(camera: &Camera, w: &[[f64; 3]; 3], settings: &ProjectSettings) -> Optio
         ..
     } = *camera;
     let fisheye = matches!(lens, Lens::OpenCvFisheye(_));
-    let domain = lens.domain(camera.intrinsics, size);
+    let domain = lens.photo_domain(camera.intrinsics, size);
     let (reach, blur) = reach(settings);
     let growth = reach * fx.max(fy) * JACOBIAN_SLACK * stretch(w);
 
