@@ -34,6 +34,15 @@ pub enum CaptureError {
         /// The capture's folder.
         root: PathBuf,
     },
+    /// The folder of other cameras holds no COLMAP model.
+    #[error(
+        "{}: no cameras: they are read from a COLMAP model, the files cameras and images, both .bin or both .txt; a run that refined its cameras writes them to `cameras` in its own folder",
+        folder.display()
+    )]
+    NoCameras {
+        /// The folder.
+        folder: PathBuf,
+    },
     /// One of the files of a model is missing.
     #[error("{}: missing; a COLMAP model needs cameras and images, both .bin or both .txt", path.display())]
     MissingModelFile {

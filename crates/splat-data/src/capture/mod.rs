@@ -252,7 +252,7 @@ impl Capture {
         let photos = images::folder(root, &model, options)?;
         let mut views = images::load(root, &photos, &model, options, progress, &mut warnings)?;
         if let Some(folder) = &options.cameras {
-            other_cameras::take(folder, &mut views, &mut warnings)?;
+            other_cameras::take(folder, options.downscale, &mut views, &mut warnings)?;
         }
         warnings.extend(lens_checks::fold_back(&model, &views));
         if model.points.is_empty() {

@@ -9,10 +9,15 @@ use super::{CaptureError, CaptureSettings, CaptureWarning, View, colmap};
 /// its name. Photos, masks and split stay those of the capture.
 pub(super) fn take(
     folder: &Path,
+    downscale: u32,
     views: &mut [View],
     warnings: &mut Vec<CaptureWarning>,
 ) -> Result<(), CaptureError> {
-    let (model, about_model) = colmap::read(folder, &CaptureSettings::new())?;
+    let read = colmap::read(folder, &CaptureSettings::new());
+    let (model, about_model) = read.map_err(|error| match error {
+        CaptureError::NoModel { root } => CaptureError::NoCameras { folder: root },
+        other => other,
+    })?;
     warnings.extend(about_model);
     let by_name: HashMap<_, _> = (model.images.iter())
         .map(|image| (&*image.name, image))
@@ -30,18 +35,22 @@ pub(super) fn take(
         };
         let camera = &model.cameras[&image.camera_id];
         let photo = [view.width, view.height];
-        let Some(intrinsics) = camera.intrinsics.fit(photo) else {
-            let size = camera.intrinsics.size().unwrap_or_default();
-            return Err(wrong(
-                view,
-                format!(
-                    "its camera is of a photo of {}x{}, not {}x{}, which is no other scale of it",
-                    size[0], size[1], photo[0], photo[1]
-                ),
-            ));
+        let whole = (camera.intrinsics.pixels())
+            .and_then(|(size, values)| Some((values, block_factor(size, photo, downscale)?)));
+        let intrinsics = match whole {
+            Some((values, factor)) => values.map(|value| value * factor),
+            None => {
+                let size = camera.intrinsics.size().unwrap_or_default();
+                rescaled.push((view.name.clone(), [photo, size]));
+                camera.intrinsics.fit(photo).ok_or_else(|| {
+                    let reason = format!(
+                        "its camera is of a photo of {}x{}, not {}x{}, which is no other scale of it",
+                        size[0], size[1], photo[0], photo[1]
+                    );
+                    wrong(view, reason)
+                })?
+            }
         };
-        let size = camera.intrinsics.size().filter(|size| *size != photo);
-        rescaled.extend(size.map(|camera| (view.name.clone(), [photo, camera])));
         view.intrinsics = intrinsics;
         view.lens = camera.lens;
         view.viewmat = image.viewmat;
@@ -51,10 +60,46 @@ pub(super) fn take(
     Ok(())
 }
 
+/// Pixels of a photo for each of the camera's photo, if both are one photo averaged over blocks, of
+/// `downscale` pixels and of any other number. What is left over at the edges is dropped, so that
+/// the ratio of the sizes is not quite it.
+fn block_factor(camera: [u32; 2], photo: [u32; 2], downscale: u32) -> Option<f64> {
+    // Sides of the photos that have this side when averaged.
+    let wholes = |side: u32, block: u64| u64::from(side) * block..(u64::from(side) + 1) * block;
+    let block = u64::from(downscale);
+    let of_one_photo = |other: &u64| {
+        (camera.iter().zip(&photo)).all(|(camera, photo)| {
+            let (camera, photo) = (wholes(*camera, *other), wholes(*photo, block));
+            camera.start < photo.end && photo.start < camera.end
+        })
+    };
+    let about = (u64::from(photo[0]) * block).checked_div(camera[0].into())?;
+    let candidates = [about, about + 1, about.saturating_sub(1)];
+    let found = candidates
+        .into_iter()
+        .find(|other| *other > 0 && of_one_photo(other));
+    Some(found? as f64 / f64::from(downscale))
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::test_capture::TestCapture;
-    use crate::{Capture, CaptureError, CaptureSettings, Lens, SplitRule};
+    use super::block_factor;
+    use crate::{Capture, CaptureError, CaptureSettings, CaptureWarning, Lens, SplitRule};
+
+    #[test]
+    fn photos_in_blocks_are_scaled_by_the_blocks() {
+        // 269 x 479 pixels, averaged by 8 and by 3, and whole.
+        assert_eq!(block_factor([269, 479], [33, 59], 8), Some(0.125));
+        assert_eq!(block_factor([33, 59], [269, 479], 1), Some(8.0));
+        assert_eq!(block_factor([33, 59], [89, 159], 3), Some(8.0 / 3.0));
+        assert_eq!(block_factor([33, 59], [33, 59], 8), Some(1.0));
+        assert_eq!(block_factor([269, 479], [269, 479], 1), Some(1.0));
+        // Made smaller by something else, and another photo.
+        assert_eq!(block_factor([4946, 3286], [1237, 822], 1), None);
+        assert_eq!(block_factor([269, 479], [479, 269], 1), None);
+        assert_eq!(block_factor([0, 479], [1, 1], 1), None);
+    }
 
     #[test]
     fn views_get_the_cameras_of_another_model() {
@@ -86,13 +131,16 @@ mod tests {
             assert_eq!((&found.name, &found.image), (&own.name, &own.image));
         }
 
-        // Cameras of photos of half the size fit the whole ones, with a warning.
-        let whole = Capture::load(folder.path(), &settings.clone().with_downscale(1)).unwrap();
-        let warned = whole
-            .warnings
-            .iter()
-            .any(|w| w.to_string().contains("scaled to the photos"));
-        assert!(warned, "{:?}", whole.warnings);
+        // Photos of 2 x 2 pixels for each, and of a block of another size, whatever is cut off.
+        for (downscale, factor) in [(1, 2.0), (4, 0.5)] {
+            let other = settings.clone().with_downscale(downscale);
+            let other = Capture::load(folder.path(), &other).unwrap();
+            for (found, refined) in other.views.iter().zip(&refined.views) {
+                assert_eq!(found.intrinsics, refined.intrinsics.map(|x| factor * x));
+            }
+            let rescaled = |w: &CaptureWarning| matches!(w, CaptureWarning::RescaledPhotos { .. });
+            assert!(!other.warnings.iter().any(rescaled), "{:?}", other.warnings);
+        }
 
         refined.views.pop();
         std::fs::remove_dir_all(&model).unwrap();

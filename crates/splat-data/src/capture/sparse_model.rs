@@ -98,6 +98,14 @@ impl Intrinsics {
         }
     }
 
+    /// Size of the photos and `[fx, fy, cx, cy]` in their pixels, if these do not depend on the photo.
+    pub fn pixels(&self) -> Option<([u32; 2], [f64; 4])> {
+        match *self {
+            Self::Pixels { size, values } => Some((size, values)),
+            Self::OfPhoto { .. } => None,
+        }
+    }
+
     /// `[fx, fy, cx, cy]` for a photo of `size`, or `None` if its aspect ratio differs from the
     /// camera's, or a number overflows.
     ///
