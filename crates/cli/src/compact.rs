@@ -66,7 +66,8 @@ pub(super) fn run(args: &CompactArgs, global: &GlobalArgs) -> Result<(), Failure
     }
     let device = device::open(global)?.device;
     let mut splats = scene::read(&args.scene, global)?;
-    args.photos.warn_of_refined(&args.scene, global);
+    args.photos
+        .warn_of_refined(&args.capture, &args.scene, global);
     if splats.settings.background.is_none() {
         splats.settings.background = capture.background;
     }

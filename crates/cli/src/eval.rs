@@ -20,7 +20,7 @@ use splat_trainer::{Scores, evaluate};
   splat eval photos/ scene.ply --images images_4
   splat eval photos/ out/photos/scene.ply --cameras out/photos/cameras")]
 pub struct EvalArgs {
-    /// Capture: a folder with `images/` and `sparse/0/`
+    /// Capture: a folder with `images/` and `sparse/0/`, or with `transforms.json`
     pub capture: PathBuf,
     /// Scene: a PLY file in the 3DGS layout, SPZ or SOG
     pub scene: PathBuf,
@@ -65,7 +65,8 @@ pub(super) fn run(args: &EvalArgs, global: &GlobalArgs) -> Result<(), Failure> {
     }
     let device = device::open(global)?.device;
     let (gaussians, settings) = scene::open(&args.scene, &device, args.sh_precision, global)?;
-    args.photos.warn_of_refined(&args.scene, global);
+    args.photos
+        .warn_of_refined(&args.capture, &args.scene, global);
     probe_files([&args.json])?;
     refuse_inputs(args.json.clone(), [args.scene.as_path()])?;
     let scores = evaluate(&gaussians, &views, &settings, &device, |_, _| {})?;

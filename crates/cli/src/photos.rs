@@ -8,7 +8,7 @@ use std::sync::{Mutex, PoisonError};
 use clap::Args;
 
 use super::command_line::quoted;
-use super::train::CAMERAS;
+use super::train::{CAMERAS, UNDISTORTED};
 use super::{Failure, GlobalArgs};
 use crate::report::progress::Progress;
 use splat_data::{Capture, CaptureError, CaptureSettings, SplitRule};
@@ -75,6 +75,11 @@ pub(super) fn load(
     capture
 }
 
+/// True if both paths lead to the same file or folder.
+fn is_same(a: &Path, b: &Path) -> bool {
+    matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
+}
+
 impl PhotoArgs {
     /// The requested settings, or the defaults.
     pub(super) fn options(&self) -> CaptureSettings {
@@ -103,10 +108,11 @@ impl PhotoArgs {
 
     /// Says so if the run of a scene refined its cameras and others are used: the scene fits the
     /// refined ones.
-    pub(super) fn warn_of_refined(&self, scene: &Path, global: &GlobalArgs) {
+    pub(super) fn warn_of_refined(&self, capture: &Path, scene: &Path, global: &GlobalArgs) {
         let refined = scene.with_file_name(CAMERAS);
         // A later run without refinement removes the files, not the folder.
-        if self.cameras.is_none() && refined.join("cameras.bin").is_file() {
+        let used = self.cameras.is_some() || is_same(capture, &scene.with_file_name(UNDISTORTED));
+        if !used && refined.join("cameras.bin").is_file() {
             global.say(format_args!(
                 "warning: the run of {} refined its cameras, and those of the capture are used; for the refined ones add --cameras {}",
                 scene.display(),

@@ -94,7 +94,7 @@ pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure>
             capture: Some(path),
             ..
         } => {
-            args.photos.warn_of_refined(&args.scene, global);
+            args.photos.warn_of_refined(path, &args.scene, global);
             let capture = args.photos.open(path, global)?;
             inputs.extend(capture.photo_files());
             cameras::of_capture(&capture)

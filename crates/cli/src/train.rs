@@ -16,7 +16,7 @@ use super::photos::{self, PhotoArgs};
 use super::{Failure, GlobalArgs, device, eval, interrupt, print, text};
 use crate::report::progress::Progress;
 use crate::report::refuse_inputs;
-pub(super) use results::CAMERAS;
+pub(super) use results::{CAMERAS, UNDISTORTED};
 use results::{CHECKPOINT, CONFIG, RunFolder, picture_names};
 use resume::Interrupted;
 use splat_data::{Capture, CaptureSettings};
@@ -52,7 +52,7 @@ A checkpoint is also written every minute, so that --resume goes on after a cras
 and the like. --steps and --max-gaussians may be given anew: they hold from there on, schedules follow
 the new number of steps, and config.toml notes it, for the run cannot be repeated from it alone then.")]
 pub struct TrainArgs {
-    /// Capture: a folder with `images/` and `sparse/0/`
+    /// Capture: a folder with `images/` and `sparse/0/`, or with `transforms.json`
     pub capture: PathBuf,
     /// Folder to write to [default: out/<name of the capture>]
     #[arg(long, value_name = "DIR")]
@@ -312,6 +312,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
             there.display()
         )));
     }
+    folder.note_undistorted();
     if fresh && folder.is_taken() {
         global.say(format_args!(
             "{}: the results of an earlier run are replaced when this one ends or is interrupted",
@@ -323,7 +324,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
     let trained = trained.map_err(|error| folder.stopped(error.into()))?;
 
     if trained.steps < config.steps {
-        folder.interrupted(&trained)?;
+        folder.interrupted(&trained, &capture, &config)?;
         global.say(format_args!(
             "stopped after {} of {} steps; to go on: {resume}",
             trained.steps, config.steps

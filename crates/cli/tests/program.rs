@@ -178,11 +178,11 @@ fn cameras_are_refined_and_written() {
         "{said}"
     );
     // The run's figures are those of its own cameras, and others are used with a warning.
-    let eval = |more: &[&str]| {
+    let eval = |capture: &Path, more: &[&str]| {
         let json = folder.path().join("scores.json");
         let scene = out.join("scene.ply");
         let words = [
-            &["--device", "cpu", "eval", text(&capture), text(&scene)][..],
+            &["--device", "cpu", "eval", text(capture), text(&scene)][..],
             &["--downscale", "4", "--json", text(&json)],
             more,
         ];
@@ -194,13 +194,15 @@ fn cameras_are_refined_and_written() {
         let said = String::from_utf8_lossy(&output.stderr).into_owned();
         (scores["psnr"].as_f64().unwrap(), said)
     };
-    let (by_refined, said) = eval(&["--cameras", text(&cameras)]);
+    let (by_refined, said) = eval(&capture, &["--cameras", text(&cameras)]);
     assert!(!said.contains("warning"), "{said}");
     assert!(
         (by_refined - aligned).abs() < 1e-3,
         "{by_refined} for {aligned}"
     );
-    let (by_own, said) = eval(&[]);
+    let (_, said) = eval(&out.join("undistorted"), &[]);
+    assert!(!said.contains("--cameras"), "{said}");
+    let (by_own, said) = eval(&capture, &[]);
     let advice = format!("add --cameras {}", text(&cameras));
     assert!(said.contains(&advice) && by_own != by_refined, "{said}");
     // Refined cameras are replaced with the scene that they belong to.

@@ -38,7 +38,7 @@ const CURVES: &str = "curves.svg";
 /// The folder of refined cameras, a COLMAP model.
 pub(crate) const CAMERAS: &str = "cameras";
 /// The folder of undistorted photos with their cameras.
-const UNDISTORTED: &str = "undistorted";
+pub(crate) const UNDISTORTED: &str = "undistorted";
 /// The pictures' folder.
 const VIEWS: &str = "views";
 
@@ -72,6 +72,22 @@ impl Saving {
     }
 }
 
+/// The views with the cameras that the run has refined.
+fn refined_views(trained: &Trained, capture: &Capture) -> Result<Vec<View>, Failure> {
+    let cameras = trained.cameras(capture)?;
+    let views = capture.views.iter().zip(&cameras);
+    Ok(views
+        .map(|(view, camera)| view.with_camera(camera))
+        .collect())
+}
+
+fn with_views(capture: &Capture, views: Vec<View>) -> Capture {
+    Capture {
+        views,
+        ..capture.clone()
+    }
+}
+
 impl RunFolder<'_> {
     /// Checks that everything can be written, before there is anything to lose, and without
     /// replacing a photo.
@@ -99,6 +115,17 @@ impl RunFolder<'_> {
         (self.undistort && folder.exists()).then_some(folder)
     }
 
+    /// Says that undistorted photos of an earlier run stay, if they do.
+    pub(super) fn note_undistorted(&self) {
+        let folder = self.folder.join(UNDISTORTED);
+        if !self.undistort && folder.exists() {
+            self.global.say(format_args!(
+                "warning: {}: of an earlier run, and not of this scene; it stays as it is",
+                folder.display()
+            ));
+        }
+    }
+
     /// The picture of a view.
     fn picture(&self, stem: &str) -> PathBuf {
         self.folder.join(VIEWS).join(format!("{stem}.png"))
@@ -124,10 +151,21 @@ impl RunFolder<'_> {
     }
 
     /// Saves an interrupted run.
-    pub(super) fn interrupted(&self, trained: &Trained) -> Result<(), Failure> {
+    pub(super) fn interrupted(
+        &self,
+        trained: &Trained,
+        capture: &Capture,
+        config: &TrainSettings,
+    ) -> Result<(), Failure> {
         let mut saving = Saving::default();
         let scene = self.save_scene(&mut saving, trained);
         saving.keep(CHECKPOINT, self.save_checkpoint(trained));
+        if scene && config.calibration.is_on() {
+            // Held-out views are aligned once the run is complete.
+            let saved =
+                refined_views(trained, capture).and_then(|views| self.save_refined(capture, views));
+            saving.keep(CAMERAS, saved);
+        }
         self.save_course(&mut saving, trained, scene);
         self.note_other_pictures(&[]);
         self.outcome(saving)
@@ -208,6 +246,12 @@ impl RunFolder<'_> {
         saving.keep(CURVES, curves(history).write(&self.folder.join(CURVES)));
     }
 
+    /// Saves the cameras of the views.
+    fn save_refined(&self, capture: &Capture, views: Vec<View>) -> Result<(), Failure> {
+        let refined = with_views(capture, views);
+        Ok(refined.save_model(&self.folder.join(CAMERAS))?)
+    }
+
     /// Measures the held-out views and saves their pictures.
     fn save_views(
         &self,
@@ -260,11 +304,7 @@ impl RunFolder<'_> {
             return None;
         }
         let measure = || -> Result<(Vec<View>, Option<AlignedScores>), Failure> {
-            let cameras = trained.cameras(capture)?;
-            let refined = capture.views.iter().zip(&cameras);
-            let mut refined: Vec<View> = refined
-                .map(|(view, camera)| view.with_camera(camera))
-                .collect();
+            let mut refined = refined_views(trained, capture)?;
             if !calibration.poses || capture.split.test.is_empty() {
                 return Ok((refined, None));
             }
@@ -283,16 +323,12 @@ impl RunFolder<'_> {
                 return None;
             }
         };
-        let refined = Capture {
-            views,
-            ..capture.clone()
-        };
         if calibration.is_on() {
-            saving.keep(CAMERAS, refined.save_model(&self.folder.join(CAMERAS)));
+            saving.keep(CAMERAS, self.save_refined(capture, views.clone()));
         }
         if self.undistort {
             let folder = self.folder.join(UNDISTORTED);
-            let undistorted = refined
+            let undistorted = with_views(capture, views)
                 .undistorted()
                 .and_then(|capture| capture.save(&folder));
             saving.keep(UNDISTORTED, undistorted);

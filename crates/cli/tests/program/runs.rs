@@ -116,13 +116,14 @@ fn the_printed_commands_work_when_pasted() {
     let capture = folder.path().join("it's my \"$HOME\" capture");
     fs::rename(example(folder.path()), &capture).unwrap();
     let out = "-o u't";
-    let said = interrupted(&capture, out, &["--seed", "5"]);
+    let said = interrupted(&capture, out, &["--seed", "5", "--refine-intrinsics"]);
     let left = folder.path().join(out);
     for file in [
         "scene.ply",
         "checkpoint.safetensors",
         "config.toml",
         "losses.csv",
+        "cameras/cameras.bin",
     ] {
         assert!(left.join(file).is_file(), "no {file}");
     }

@@ -118,7 +118,9 @@ pub(crate) fn adjust_bundle_watched(
         false => of_observations(watched, capture, &views, unknowns),
         true => of_corners(watched, &views, unknowns)?,
     };
-    watched.done(1, 1);
+    if !watched.is_interrupted() {
+        watched.done(1, 1);
+    }
     Ok(adjusted)
 }
 

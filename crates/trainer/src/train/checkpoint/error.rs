@@ -23,7 +23,7 @@ pub enum CheckpointError {
     },
     /// The checkpoint belongs to a run on another capture.
     #[error(
-        "{path}: the run was begun on another capture (`{name}`): {difference}; give the capture it was begun on, or begin another run in another folder"
+        "{path}: the run was begun on another capture (`{name}`): {difference}; give the capture it was begun on, with the --cameras and the photos of then, or begin another run in another folder"
     )]
     OtherCapture {
         /// The file.
