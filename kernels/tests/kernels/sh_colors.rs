@@ -3,6 +3,7 @@
 //! bit.
 
 use cubecl::client::Client;
+use rand_pcg::Pcg32;
 use splat_core::ShColorTensors;
 use splat_kernels::sh_colors::{ShColorInputs, ShRest, sh_colors, sh_colors_backward};
 use splat_kernels::{Buffer, HalfBuffer, reads_half};
