@@ -13,7 +13,7 @@ use super::{CaptureError, Point};
 /// Bytes of a camera record up to its parameters, of the shortest image record, and of the shortest
 /// point record.
 const MIN_CAMERA: usize = 4 + 4 + 8 + 8;
-pub(super) const MIN_IMAGE: usize = 4 + 7 * 8 + 4 + 1 + 8;
+const MIN_IMAGE: usize = 4 + 7 * 8 + 4 + 1 + 8;
 const MIN_POINT: usize = 8 + 3 * 8 + 3 + 8 + 8;
 /// Bytes of one keypoint (x, y, point id) and of one track entry (image id, keypoint index).
 const KEYPOINT: usize = 8 + 8 + 8;
@@ -38,6 +38,22 @@ pub(super) fn parse_cameras(path: &Path, bytes: &[u8]) -> Result<Vec<ColmapCamer
         }
         Ok(ColmapCamera::new(id, [width, height], layout, values))
     })
+}
+
+/// The number of images that the `head` of an `images.bin` of this length announces.
+pub(super) fn count_images(path: &Path, head: &[u8], length: u64) -> Result<u64, CaptureError> {
+    let count = Reader::new(path, head).u64(FILE, "count")?;
+    let remaining = length.saturating_sub(head.len() as u64);
+    if count > remaining / MIN_IMAGE as u64 {
+        return Err(CaptureError::ImpossibleCount {
+            path: path.to_path_buf(),
+            record: FILE.to_string(),
+            what: "images",
+            count,
+            remaining: usize::try_from(remaining).unwrap_or(usize::MAX),
+        });
+    }
+    Ok(count)
 }
 
 /// Reads `images.bin`; the keypoints are skipped unless they are asked for.

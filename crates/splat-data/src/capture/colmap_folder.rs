@@ -16,17 +16,38 @@ pub(super) fn find(root: &Path) -> Result<(PathBuf, Vec<CaptureWarning>), Captur
         };
         return Ok((folders.pop().ok_or_else(no_model)?, vec![]));
     }
-    let others = folders.len() - 1;
-    let counted = folders.into_iter().map(|folder| (images(&folder), folder));
-    let (images, used) = counted
-        .reduce(|best, next| if next.0 > best.0 { next } else { best })
-        .unwrap_or_default();
-    let warning = CaptureWarning::OtherModels {
-        used: used.clone(),
-        images,
-        others,
+    let mut counted = Vec::new();
+    let mut damaged = Vec::new();
+    for folder in &folders {
+        match images(folder) {
+            Ok(images) => counted.push((images, folder)),
+            Err(error) => damaged.push(error.to_string()),
+        }
+    }
+    let others = counted.len().saturating_sub(1);
+    let largest = counted
+        .into_iter()
+        .reduce(|best, next| if next.0 > best.0 { next } else { best });
+    let Some((images, used)) = largest else {
+        // Reading it says why it cannot be read.
+        return Ok((folders[0].clone(), vec![]));
     };
-    Ok((used, vec![warning]))
+    let mut warnings = Vec::new();
+    if others > 0 {
+        warnings.push(CaptureWarning::OtherModels {
+            used: used.clone(),
+            images,
+            others,
+        });
+    }
+    let count = damaged.len();
+    let first = damaged.into_iter().next();
+    warnings.extend(first.map(|first| CaptureWarning::DamagedModels {
+        used: used.clone(),
+        count,
+        first,
+    }));
+    Ok((used.clone(), warnings))
 }
 
 /// Folders of the capture that hold a model: the numbered ones in `sparse`, or else the first of
@@ -56,23 +77,24 @@ pub(super) fn candidates(root: &Path) -> Vec<PathBuf> {
         .collect()
 }
 
-/// Number of images of the model in a folder; 0 if it cannot be told.
-fn images(folder: &Path) -> u64 {
-    let count = || -> Option<u64> {
-        let files = ModelFiles::find(folder).ok()?;
-        if !files.binary {
-            let text = std::fs::read(&files.images).ok()?;
-            let images = colmap_text::parse_images(&files.images, &text, false).ok()?;
-            return Some(images.records.len() as u64);
-        }
-        let mut file = File::open(&files.images).ok()?;
-        let mut count = [0; 8];
-        file.read_exact(&mut count).ok()?;
-        let count = u64::from_le_bytes(count);
-        let room = file.metadata().ok()?.len() / colmap_binary::MIN_IMAGE as u64;
-        (count <= room).then_some(count)
+/// Number of images of the model in a folder. Of a binary model, only the head of the file is read.
+fn images(folder: &Path) -> Result<u64, CaptureError> {
+    let files = ModelFiles::find(folder)?;
+    let path = &files.images;
+    let io_error = |source| CaptureError::Io {
+        path: path.clone(),
+        source,
     };
-    count().unwrap_or(0)
+    if !files.binary {
+        let text = std::fs::read(path).map_err(io_error)?;
+        let images = colmap_text::parse_images(path, &text, false)?;
+        return Ok(images.records.len() as u64);
+    }
+    let file = File::open(path).map_err(io_error)?;
+    let length = file.metadata().map_err(io_error)?.len();
+    let mut head = Vec::new();
+    file.take(8).read_to_end(&mut head).map_err(io_error)?;
+    colmap_binary::count_images(path, &head, length)
 }
 
 /// The three files of a model, all in one encoding.
@@ -118,5 +140,84 @@ impl ModelFiles {
         [&self.cameras, &self.images]
             .into_iter()
             .find(|path| !path.is_file())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::test_capture::{TestCapture, good, load};
+    use super::*;
+
+    /// The damaged one may be the larger part of the reconstruction.
+    #[test]
+    fn a_model_that_cannot_be_read_is_named_beside_the_one_that_is() {
+        type Spoil = fn(&Path);
+        let cases: [(&str, Spoil); 6] = [
+            ("images.txt: line 1", |folder| {
+                TestCapture::new().write_text(folder);
+                std::fs::write(folder.join("images.txt"), "junk\n").unwrap();
+            }),
+            ("images.txt: UTF-16", |folder| {
+                TestCapture::new().write_text(folder);
+                std::fs::write(folder.join("images.txt"), b"\xff\xfe1\0").unwrap();
+            }),
+            ("images.txt: missing", |folder| {
+                TestCapture::new().write_text(folder);
+                std::fs::remove_file(folder.join("images.txt")).unwrap();
+            }),
+            ("images.bin: missing", |folder| {
+                TestCapture::new().write_binary(folder);
+                std::fs::remove_file(folder.join("images.bin")).unwrap();
+            }),
+            ("images.bin: truncated", |folder| {
+                TestCapture::new().write_binary(folder);
+                std::fs::write(folder.join("images.bin"), [9, 0, 0]).unwrap();
+            }),
+            ("images.bin: the file announces", |folder| {
+                TestCapture::new().write_binary(folder);
+                std::fs::write(folder.join("images.bin"), [0xff; 80]).unwrap();
+            }),
+        ];
+        for (words, spoil) in cases {
+            let (root, mut model) = good();
+            let sparse = root.path().join("sparse");
+            model.images.truncate(2);
+            model.write_binary(&sparse.join("0"));
+            spoil(&sparse.join("1"));
+            let warnings = load(root.path()).unwrap().warnings;
+            let [damaged, CaptureWarning::UnregisteredPhotos { .. }] = &warnings[..] else {
+                panic!("a warning of a damaged model, not {warnings:?}");
+            };
+            let damaged = damaged.to_string();
+            for words in ["1 model(s)", "sparse/0", &format!("sparse/1/{words}")] {
+                assert!(damaged.contains(words), "`{damaged}` without `{words}`");
+            }
+            assert!(!damaged.contains('\n'), "{damaged}");
+
+            // A third one is still counted.
+            model.images.truncate(1);
+            model.write_binary(&sparse.join("2"));
+            let (used, warnings) = find(root.path()).unwrap();
+            let others = CaptureWarning::OtherModels {
+                used: sparse.join("0"),
+                images: 2,
+                others: 1,
+            };
+            assert_eq!((used, &warnings[0]), (sparse.join("0"), &others));
+            assert_eq!(warnings[1].to_string(), damaged);
+        }
+    }
+
+    #[test]
+    fn folders_without_a_model_are_not_damaged_and_models_that_all_are_end_the_reading() {
+        let (root, _) = good();
+        let sparse = root.path().join("sparse");
+        std::fs::create_dir(sparse.join("1")).unwrap();
+        assert_eq!(load(root.path()).unwrap().warnings, []);
+
+        std::fs::remove_file(sparse.join("0/images.bin")).unwrap();
+        std::fs::write(sparse.join("1/cameras.bin"), b"").unwrap();
+        let message = load(root.path()).unwrap_err().to_string();
+        assert!(message.contains("sparse/0/images.bin"), "{message}");
     }
 }

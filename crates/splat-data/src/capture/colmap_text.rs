@@ -54,15 +54,16 @@ pub(super) fn parse_cameras(
             by_name(&model).map_err(|model| CaptureError::unsupported_camera(path, id, model))?;
         let size = [fields.next("width")?, fields.next("height")?];
         let count = layout.parameters();
+        let given = fields.fields.clone().count();
+        if given != count {
+            return Err(fields.error(&format!(
+                "the camera model {model} of camera {id} has {count} parameters, but the line gives {given}"
+            )));
+        }
         let mut values = [0.0; MOST_PARAMETERS];
         let values = &mut values[..count];
         for value in &mut *values {
             *value = fields.next("parameters")?;
-        }
-        if fields.fields.next().is_some() {
-            return Err(fields.error(&format!(
-                "it has more than the {count} parameters of {model}"
-            )));
         }
         Ok(ColmapCamera::new(id, size, layout, values))
     };

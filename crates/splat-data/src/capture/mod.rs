@@ -10,6 +10,7 @@
 //! Conventions (project-wide): right-handed world; camera axes +x right, +y down, +z forward; the
 //! view matrix maps world to camera; the centre of pixel (i, j) is at (i + 0.5, j + 0.5).
 
+mod check;
 mod colmap;
 mod colmap_binary;
 mod colmap_checks;
@@ -254,7 +255,7 @@ impl Capture {
         if let Some(folder) = &options.cameras {
             other_cameras::take(folder, options.downscale, &mut views, &mut warnings)?;
         }
-        warnings.extend(lens_checks::fold_back(&model, &views));
+        warnings.extend(lens_checks::check(&views));
         if model.points.is_empty() {
             let cameras: Vec<Camera> = views.iter().map(View::camera).collect();
             let room = model.room.unwrap_or_else(|| Room::of_cameras(&cameras));
@@ -280,21 +281,6 @@ impl Capture {
             views,
             warnings,
         })
-    }
-
-    /// Checks that there is at least one view to train on.
-    ///
-    /// # Errors
-    ///
-    /// [`CaptureError::NothingToTrainOn`], for example for a single photo under the default split.
-    pub fn check_trainable(&self) -> Result<(), CaptureError> {
-        if self.split.train.is_empty() {
-            return Err(CaptureError::NothingToTrainOn {
-                root: self.root.clone(),
-                photos: self.views.len(),
-            });
-        }
-        Ok(())
     }
 
     /// Files of the photos, in the order of the views.

@@ -86,8 +86,17 @@ pub enum CaptureWarning {
         used: PathBuf,
         /// Number of its images.
         images: u64,
-        /// Number of other models beside it.
+        /// Number of other models beside it that can be read.
         others: usize,
+    },
+    /// Models that cannot be read, beside the one that is; they may have more images.
+    DamagedModels {
+        /// The folder that was read.
+        used: PathBuf,
+        /// Number of such models.
+        count: usize,
+        /// Why the first of them cannot be read, with the name of the file.
+        first: String,
     },
     /// The folder holds another capture, which is not read.
     OtherCapture {
@@ -128,12 +137,23 @@ pub enum CaptureWarning {
     },
     /// Lenses that fold back inside of the photo: no direction falls on its border.
     LensFoldsBack {
-        /// Number of such cameras.
+        /// Number of photos with such a lens.
         count: usize,
-        /// Id of the first of them.
-        camera: u32,
+        /// The first of them.
+        first: String,
         /// Share of its pixels that no direction falls on.
         share: f64,
+    },
+    /// Principal points outside of the photo by more than the photo's size.
+    PrincipalPointFarAway {
+        /// Number of photos with such a camera.
+        count: usize,
+        /// The first of them.
+        first: String,
+        /// The principal point of its camera in its pixels, x and y.
+        center: [f64; 2],
+        /// Its width and height.
+        size: [u32; 2],
     },
     /// The split names photos that the capture does not have.
     SplitNamesUnknown {
@@ -261,6 +281,11 @@ impl CaptureWarning {
                 used.display(),
                 others + 1
             ),
+            Self::DamagedModels { used, count, first } => write!(
+                f,
+                "{count} model(s) beside {} cannot be read, and may have more images; repair or remove them; the first: {first}",
+                used.display()
+            ),
             Self::OtherCapture { used, other } => write!(
                 f,
                 "{} is not read, because the folder has {used} too; name that file instead of the folder to read it",
@@ -279,13 +304,22 @@ impl CaptureWarning {
                 f,
                 "the capture has no points: training starts from {count} random ones in a cube of +-{half_side:.4} about ({x:.4}, {y:.4}, {z:.4}); triangulated points (`colmap point_triangulator`) give better results"
             ),
+            Self::PrincipalPointFarAway {
+                count,
+                first,
+                center: [x, y],
+                size: [width, height],
+            } => write!(
+                f,
+                "{count} photo(s) have a camera whose principal point is far outside of them, from `{first}`: ({x:?}, {y:?}) in its {width}x{height} pixels; correct cx and cy of the camera, which usually are about half of the width and height"
+            ),
             Self::LensFoldsBack {
                 count,
-                camera,
+                first,
                 share,
             } => write!(
                 f,
-                "{count} camera(s) have a lens that folds back inside of the photo, from camera {camera}: no direction falls on {:.0} % of its pixels, at the border, which therefore stay empty; calibrate it again, mask the border, or undistort the photos",
+                "{count} photo(s) have a lens that folds back inside of them, from `{first}`: no direction falls on {:.0} % of its pixels, at the border, which therefore stay empty; calibrate it again, mask the border, or undistort the photos",
                 (100.0 * share).max(1.0)
             ),
             Self::SplitNamesUnknown {

@@ -38,6 +38,13 @@ pub enum Warning {
         /// `init.scale`.
         init_scale: f64,
     },
+    /// All cameras of the training photos stand in one place.
+    CamerasInOnePlace {
+        /// Number of training photos.
+        views: usize,
+        /// The place, world units.
+        place: [f64; 3],
+    },
     /// Cameras among the points, where other cameras are not.
     CamerasInsidePoints {
         /// Names of their photos.
@@ -191,6 +198,16 @@ impl fmt::Display for Warning {
                 "the first Gaussians are {} wide at a distance of {}, each covers most of a picture; init.scale is {init_scale} (usually 1), or the points are too few",
                 Length(*scale),
                 Length(*distance)
+            ),
+            Self::CamerasInOnePlace {
+                views,
+                place: [x, y, z],
+            } => write!(
+                f,
+                "the cameras of all {views} training photos stand in one place, ({}, {}, {}), from which no depth can be told: the scene will look right only from there; correct the poses, or take photos from several places",
+                Length(*x),
+                Length(*y),
+                Length(*z)
             ),
             Self::CamerasInsidePoints { views, near, usual } => write!(
                 f,

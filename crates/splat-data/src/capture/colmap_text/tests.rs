@@ -172,14 +172,6 @@ fn records_end_where_they_should() {
     let head = "# Camera list\n# Number of cameras: 3\n";
     let listed = cameras(&format!("\u{feff}{head}7 PINHOLE 32 24 40 41 15 12\r\n")).unwrap();
     assert_eq!((listed.records.len(), listed.announced), (1, Some(3)));
-    // A pinhole camera with an extra parameter has another model.
-    let message = cameras("7 PINHOLE 32 24 40 41 15 12 0.1")
-        .unwrap_err()
-        .to_string();
-    assert!(
-        message.contains("line 1") && message.contains("PINHOLE"),
-        "{message}"
-    );
 
     let head = "# Number of points: 2, mean track length: 1\n";
     for track in ["", " 0.5", " 0.5 1 2", " 0.5 1 2 3 4"] {
@@ -194,6 +186,33 @@ fn records_end_where_they_should() {
             .unwrap_err()
             .to_string();
         assert!(message.contains("line 1"), "{message}");
+    }
+}
+
+/// A camera with a parameter too few or too many has another model.
+#[test]
+fn the_number_of_parameters_is_that_of_the_model() {
+    let cameras = |text: &str| parse_cameras("cameras.txt".as_ref(), text.as_bytes());
+    for (line, words) in [
+        (
+            "7 PINHOLE 32 24 40 41 15",
+            "has 4 parameters, but the line gives 3",
+        ),
+        (
+            "7 PINHOLE 32 24 40 41 15 12 0.1",
+            "has 4 parameters, but the line gives 5",
+        ),
+        ("7 PINHOLE 32 24", "has 4 parameters, but the line gives 0"),
+        (
+            "7 OPENCV 32 24 40 41 15 12 x",
+            "has 8 parameters, but the line gives 5",
+        ),
+    ] {
+        let message = cameras(line).unwrap_err().to_string();
+        let model = line.split(' ').nth(1).unwrap();
+        for word in ["cameras.txt: line 1", "camera 7", model, words] {
+            assert!(message.contains(word), "`{message}` does not say `{word}`");
+        }
     }
 }
 

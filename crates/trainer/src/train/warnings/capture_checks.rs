@@ -20,6 +20,10 @@ const COMPACT: f64 = 1e-3;
 /// standard deviations to either side, so at a quarter it is wider than a picture of 70 degrees;
 /// points of real captures give about 0.005.
 const LARGE: f64 = 0.25;
+/// Largest distance of cameras from the first one, relative to that of the points, at which they
+/// stand in one place: a point shifts by about a tenth of a pixel, at most, in photos with a focal
+/// length of ten thousand. Copies of one position differ by rounding only.
+const ONE_PLACE: f64 = 1e-5;
 /// Smallest number of cameras that are compared; among fewer, none is typical.
 const COMPARABLE: usize = 4;
 /// A camera is among the points if the nearest percent is closer than this share of the usual
@@ -62,6 +66,7 @@ pub(in crate::train) fn inspect(
     let mut warnings = Vec::new();
     warnings.extend(crowded(&positions, splats.origin.into(), distance));
     warnings.extend(large(splats, config, distance));
+    warnings.extend(one_place(capture, distance));
     warnings.extend(cameras(capture, &outlooks));
     warnings.extend(noise(&capture.views));
     warnings.extend(high_rates(config));
@@ -125,6 +130,21 @@ fn large(splats: &SplatData, config: &TrainSettings, distance: f64) -> Option<Wa
         scale,
         distance,
         init_scale: config.init.scale,
+    })
+}
+
+/// Photos from one place show no parallax, from which alone a scene is found. A single photo is not
+/// meant to give one.
+fn one_place(capture: &Capture, distance: f64) -> Option<Warning> {
+    let positions: Vec<DVec3> = capture
+        .train_views()
+        .map(|view| view.camera().position())
+        .collect();
+    let (first, others) = positions.split_first()?;
+    let is_there = |position: &DVec3| position.distance(*first) <= ONE_PLACE * distance;
+    (!others.is_empty() && others.iter().all(is_there)).then(|| Warning::CamerasInOnePlace {
+        views: positions.len(),
+        place: first.to_array(),
     })
 }
 
@@ -220,4 +240,61 @@ fn high_rates(config: &TrainSettings) -> Option<Warning> {
         .map(|(name, factor)| (format!("learning_rates.{name}"), factor))
         .collect();
     (!rates.is_empty()).then_some(Warning::HighRates { rates })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use splat_data::{Camera, CaptureSettings};
+
+    use super::*;
+
+    fn example() -> Capture {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../examples/data/saharov");
+        Capture::load(folder, &CaptureSettings::new().with_downscale(16)).unwrap()
+    }
+
+    /// The view with its camera at another position.
+    fn moved(view: &View, to: DVec3) -> View {
+        let camera = view.camera();
+        let shift = camera.position() - to;
+        view.with_pose(&Camera {
+            viewmat: camera.viewmat * glam::DMat4::from_translation(shift),
+            ..camera
+        })
+    }
+
+    #[test]
+    fn cameras_that_all_stand_in_one_place_are_told() {
+        let distance = 5.0;
+        let mut capture = example();
+        assert_eq!(one_place(&capture, distance), None);
+        // In different directions, and far from the origin.
+        let place = DVec3::new(0.1, -2000.3, 7.7);
+        for index in capture.split.train.clone() {
+            capture.views[index] = moved(&capture.views[index], place);
+        }
+        let Some(warning) = one_place(&capture, distance) else {
+            panic!("no warning");
+        };
+        let count = capture.split.train.len();
+        let Warning::CamerasInOnePlace { views, place: told } = &warning else {
+            panic!("another warning: {warning}");
+        };
+        assert_eq!(*views, count);
+        assert!(DVec3::from_array(*told).distance(place) < 1e-9, "{told:?}");
+        let message = warning.to_string();
+        for word in [&*format!("all {count} training"), "-2000.300", "poses"] {
+            assert!(message.contains(word), "{message}");
+        }
+
+        // A short way to the side is enough for depth.
+        let last = capture.split.train[count - 1];
+        capture.views[last] = moved(&capture.views[last], place + DVec3::X * 0.01);
+        assert_eq!(one_place(&capture, distance), None);
+        // One photo alone is no matter of places.
+        capture.split.train = vec![last];
+        assert_eq!(one_place(&capture, distance), None);
+    }
 }
