@@ -281,8 +281,15 @@ pub enum CaptureError {
     },
     /// No view is left for training.
     #[error(
-        "{}: nothing to train on: of {photos} photo(s) all are held out; at least 2 are needed, since every 8th from the first is held out (or name another split, in split.json for example)",
-        root.display()
+        "{}: nothing to train on: {}",
+        root.display(),
+        if *photos == 1 {
+            "its only photo is held out; at least 2 are needed, since the first is held out by default (or hold out none, with --hold-out 0)".to_owned()
+        } else {
+            format!(
+                "the split leaves none of the {photos} photos for training, as asked for with --hold-out (1 holds out every photo) or by the capture (split.json, or lists of its own); leave some of them, with --hold-out 8 for example"
+            )
+        }
     )]
     NothingToTrainOn {
         /// The capture's folder.

@@ -51,6 +51,18 @@ pub enum SplitRule {
     File(PathBuf),
 }
 
+/// The lists of a split in messages: of training photos, and of held-out ones.
+type ListNames = [&'static str; 2];
+
+/// Those of `split.json`.
+const OF_SPLIT_FILE: ListNames = ["`train`", "`test`"];
+
+/// Those of a capture's own split, which only `transforms.json` has.
+const OF_TRANSFORMS: ListNames = [
+    "`train_filenames`",
+    "`test_filenames` (or `val_filenames`, if they take its place)",
+];
+
 /// `split.json`: two lists of photo names. Other keys (such as `rule`) are comments.
 #[derive(serde::Deserialize)]
 struct SplitFile {
@@ -94,10 +106,13 @@ impl Split {
             }
             SplitRule::File(path) => Self::requested(path, names, &read(path)?, warnings),
             SplitRule::OfCapture if usual.exists() => {
-                Self::named(&usual, names, &read(&usual)?, warnings)
+                Self::named(&usual, names, &read(&usual)?, OF_SPLIT_FILE, warnings)
             }
             SplitRule::OfCapture => match own {
-                Some(own) => Self::named(root, names, own, warnings),
+                Some(own) => {
+                    let file = root.join(&own.source);
+                    Self::named(&file, names, own, OF_TRANSFORMS, warnings)
+                }
                 None => Ok(Self::every_eighth(names.len())),
             },
         }
@@ -122,15 +137,16 @@ impl Split {
                     ),
                 ))
             }
-            _ => Self::named(path, names, lists, warnings),
+            _ => Self::named(path, names, lists, OF_SPLIT_FILE, warnings),
         }
     }
 
-    /// The split of a list of names. `path` is used in messages.
+    /// The split of a list of names. `path` and `called` are used in messages.
     fn named(
         path: &Path,
         names: &[&str],
         lists: &NamedSplit,
+        called: ListNames,
         warnings: &mut Vec<CaptureWarning>,
     ) -> Result<Self, CaptureError> {
         let index_of: HashMap<&str, usize> = names
@@ -138,22 +154,28 @@ impl Split {
             .enumerate()
             .map(|(i, &name)| (name, i))
             .collect();
-        let mut seen = HashSet::new();
+        let [of_train, of_test] = called;
+        // The list in which a photo is.
+        let mut list_of: HashMap<usize, &str> = HashMap::new();
         let mut unknown: Vec<String> = Vec::new();
-        let mut indices = |list: &[String]| -> Result<Vec<usize>, CaptureError> {
+        let mut indices = |list: &[String], called: &'static str| {
             let mut indices = Vec::with_capacity(list.len());
             for name in list {
-                match index_of.get(name.as_str()) {
-                    Some(&index) if seen.insert(index) => indices.push(index),
-                    Some(_) => return Err(bad(path, format!("names the photo `{name}` twice"))),
-                    None => unknown.push(name.clone()),
+                let Some(&index) = index_of.get(name.as_str()) else {
+                    unknown.push(name.clone());
+                    continue;
+                };
+                if let Some(other) = list_of.insert(index, called) {
+                    return Err(bad(path, twice(name, called, other)));
                 }
+                indices.push(index);
             }
             indices.sort_unstable();
             Ok(indices)
         };
-        let test = indices(&lists.test)?;
-        let train = lists.train.as_deref().map(&mut indices).transpose()?;
+        let test = indices(&lists.test, of_test)?;
+        let train = lists.train.as_deref();
+        let train = train.map(|list| indices(list, of_train)).transpose()?;
         if let Some(first) = unknown.first() {
             warnings.push(CaptureWarning::SplitNamesUnknown {
                 source: lists.source.clone(),
@@ -161,7 +183,9 @@ impl Split {
                 first: first.clone(),
             });
         }
-        let rest: Vec<usize> = (0..names.len()).filter(|i| !seen.contains(i)).collect();
+        let rest: Vec<usize> = (0..names.len())
+            .filter(|i| !list_of.contains_key(i))
+            .collect();
         let Some(train) = train else {
             return Ok(Self { train: rest, test });
         };
@@ -174,6 +198,16 @@ impl Split {
         }
         Ok(Self { train, test })
     }
+}
+
+/// Why a photo in these two lists, which may be one, is refused.
+fn twice(name: &str, list: &str, other: &str) -> String {
+    if list == other {
+        return format!("names the photo `{name}` twice");
+    }
+    format!(
+        "names the photo `{name}` both in {list} and in {other}; remove it from one of them, since it is either for training or held out"
+    )
 }
 
 fn bad(path: &Path, reason: String) -> CaptureError {

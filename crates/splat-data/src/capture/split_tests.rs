@@ -66,11 +66,10 @@ fn a_named_split_is_followed() {
         r#"{"train": ["view z.png"], "test": ["view z.png"]}"#,
     )
     .unwrap();
-    assert!(
-        error_of(root.path(), "split.json")
-            .to_string()
-            .contains("view z.png")
-    );
+    let message = error_of(root.path(), "split.json").to_string();
+    for word in ["view z.png", "both in `train` and in `test`"] {
+        assert!(message.contains(word), "{message}");
+    }
     std::fs::write(&path, "[]").unwrap();
     error_of(root.path(), "split.json");
 
@@ -96,6 +95,15 @@ fn another_interval_may_be_asked_for() {
     assert_eq!(every(0), (vec![], (0..9).collect(), vec![]));
     assert_eq!(every(4), (vec![0, 4, 8], vec![1, 2, 3, 5, 6, 7], vec![]));
     assert!(every(1).1.is_empty());
+    let options = CaptureSettings::new().with_split(SplitRule::Every(1));
+    let capture = Capture::load(root.path(), &options).unwrap();
+    let message = capture.check_trainable().unwrap_err().to_string();
+    for word in [
+        "none of the 9 photos",
+        "--hold-out (1 holds out every photo)",
+    ] {
+        assert!(message.contains(word), "{message}");
+    }
     assert_eq!(every(usize::MAX).0, [0]);
 }
 

@@ -49,7 +49,7 @@ fn read(root: &Path, settings: &CaptureSettings) -> ReadModel {
     let (mut model, frames) = assemble(&chosen, documents, &mut warnings)?;
     model.photos = Some(images::folder(&chosen.folder, &model, settings)?);
     files::resolve(&chosen, &mut model, &frames, &mut warnings)?;
-    if let Some(path) = chosen.points(frames.points.as_deref()) {
+    if let Some(path) = chosen.points(frames.points.as_ref())? {
         model.points = points_file::parse(&path, &contents(&path)?)?;
     }
     Ok((model, warnings))
@@ -75,8 +75,8 @@ pub(super) fn parse_model(path: &Path, bytes: &[u8]) -> ReadModel {
 struct Named {
     /// The file of each frame, in the order of the model's images.
     frames: Vec<FrameFiles>,
-    /// `ply_file_path`.
-    points: Option<String>,
+    /// The file with `ply_file_path`, and that path.
+    points: Option<(PathBuf, String)>,
 }
 
 /// Files of a frame, relative to the folder of the capture.
@@ -101,7 +101,7 @@ fn assemble(
     let lists = documents[0].lists.clone();
     let points = documents
         .iter()
-        .find_map(|document| document.points.clone());
+        .find_map(|document| Some((document.path.clone(), document.points.clone()?)));
     let blender = documents[0].blender;
     let has_test = documents.len() > 1;
     let mut frames: Vec<Listed> = Vec::new();

@@ -103,7 +103,6 @@ impl Document {
         if listed.is_empty() {
             return Err(top.error("its list `frames` is missing or empty: it names no photo"));
         }
-        let model = camera::Model::read(&top)?;
         let mut frames = Vec::with_capacity(listed.len());
         for (index, value) in listed.iter().enumerate() {
             let Value::Object(map) = value else {
@@ -115,7 +114,7 @@ impl Document {
                 frame: Some(index),
                 map,
             };
-            frames.push(frame(&top, &fields, index, model)?);
+            frames.push(frame(&top, &fields, index)?);
         }
         let stem = path.file_stem().unwrap_or_default().to_string_lossy();
         let measured = |key: &str| top.get(key).is_some();
@@ -133,16 +132,12 @@ impl Document {
     }
 }
 
-fn frame(
-    top: &Fields<'_>,
-    fields: &Fields<'_>,
-    index: usize,
-    model: camera::Model,
-) -> Result<Frame, CaptureError> {
+fn frame(top: &Fields<'_>, fields: &Fields<'_>, index: usize) -> Result<Frame, CaptureError> {
     let file = fields.text("file_path")?.unwrap_or_default();
     if file.is_empty() {
         return Err(fields.error("its file_path is missing"));
     }
+    let model = camera::Model::read(top, fields)?;
     Ok(Frame {
         index,
         file: file.to_owned(),

@@ -32,6 +32,25 @@ impl<'a> Fields<'a> {
         }
     }
 
+    /// A truth value, for which some programs write 1 or 0.
+    pub fn flag(&self, field: &str) -> Result<Option<bool>, CaptureError> {
+        let Some(value) = self.get(field) else {
+            return Ok(None);
+        };
+        let flag = match value.as_f64() {
+            Some(0.0) => Some(false),
+            Some(1.0) => Some(true),
+            _ => value.as_bool(),
+        };
+        match flag {
+            Some(flag) => Ok(Some(flag)),
+            None => Err(self.error(&format!(
+                "its {field} is {}, neither true nor false",
+                shown(value)
+            ))),
+        }
+    }
+
     pub fn text(&self, field: &str) -> Result<Option<&'a str>, CaptureError> {
         let Some(value) = self.get(field) else {
             return Ok(None);

@@ -86,13 +86,28 @@ impl Chosen {
         unread.into_iter().collect()
     }
 
-    /// The file of points, if one is named or has a usual name.
-    pub fn points(&self, named: Option<&str>) -> Option<PathBuf> {
-        let usual = || {
+    /// The file of points, if one is named or has a usual name. `named` is a `ply_file_path` and
+    /// the file that has it.
+    pub fn points(
+        &self,
+        named: Option<&(PathBuf, String)>,
+    ) -> Result<Option<PathBuf>, CaptureError> {
+        let Some((file, name)) = named else {
             let mut paths = POINTS.iter().map(|name| self.folder.join(name));
-            paths.find(|path| path.is_file())
+            return Ok(paths.find(|path| path.is_file()));
         };
-        named.map_or_else(usual, |name| Some(self.folder.join(name)))
+        let path = self.folder.join(name);
+        if path.is_file() {
+            return Ok(Some(path));
+        }
+        Err(CaptureError::BadRecord {
+            path: file.clone(),
+            record: "the top level".to_owned(),
+            reason: format!(
+                "its ply_file_path names {}, where there is no file; correct the path, or remove the field",
+                path.display()
+            ),
+        })
     }
 }
 

@@ -213,6 +213,133 @@ fn a_frame_may_have_its_own_camera() {
     assert_eq!(capture.views[2].intrinsics[..2], [40.0, 31.0]);
 }
 
+#[test]
+fn a_frame_may_have_its_own_camera_model() {
+    let capture = loaded(|json| {
+        json["camera_model"] = "OPENCV".into();
+        json["k1"] = 0.1.into();
+        json["frames"][2]["camera_model"] = "OPENCV_FISHEYE".into();
+        json["frames"][2]["k1"] = 0.2.into();
+        json["frames"][3]["is_fisheye"] = false.into();
+    });
+    let perspective = Lens::OpenCv([0.1, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]);
+    assert_eq!(capture.views[1].lens, perspective);
+    assert_eq!(
+        capture.views[2].lens,
+        Lens::OpenCvFisheye([0.2, 0.0, 0.0, 0.0])
+    );
+    assert_eq!(capture.views[3].lens, perspective);
+    // It comes before everything that the top level says, even what cannot be read.
+    let capture = loaded(|json| {
+        json["camera_model"] = "EQUIRECTANGULAR".into();
+        json["is_fisheye"] = true.into();
+        for frame in json["frames"].as_array_mut().unwrap() {
+            frame["camera_model"] = "PINHOLE".into();
+        }
+    });
+    assert_eq!(capture.views[2].lens, Lens::Pinhole);
+
+    let message = refused(|json| json["frames"][2]["camera_model"] = "EQUIRECTANGULAR".into());
+    for word in ["frames[2] (`images/2.png`)", "EQUIRECTANGULAR"] {
+        assert!(message.contains(word), "{message}");
+    }
+    // The top level's coefficients are those of another formula.
+    let message = refused(|json| {
+        json["k1"] = 0.1.into();
+        json["frames"][2]["camera_model"] = "OPENCV_FISHEYE".into();
+    });
+    for word in ["frames[2]", "a fisheye", "coefficients of its own"] {
+        assert!(message.contains(word), "{message}");
+    }
+}
+
+#[test]
+fn is_fisheye_agrees_with_the_camera_model() {
+    let lens = |model: Option<&str>, flag: Value| {
+        loaded(|json| {
+            json["camera_model"] = model.into();
+            json["is_fisheye"] = flag;
+        })
+        .views[3]
+            .lens
+    };
+    let fisheye = Lens::OpenCvFisheye([0.0; 4]);
+    for yes in [json!(true), json!(1), json!(1.0)] {
+        assert_eq!(lens(None, yes.clone()), fisheye);
+        assert_eq!(lens(Some("OPENCV_FISHEYE"), yes.clone()), fisheye);
+        let message = refused(|json| {
+            json["camera_model"] = "OPENCV".into();
+            json["is_fisheye"] = yes;
+        });
+        for word in [
+            "the top level",
+            "is_fisheye",
+            "camera_model to OPENCV_FISHEYE",
+        ] {
+            assert!(message.contains(word), "{message}");
+        }
+    }
+    for no in [json!(false), json!(0), Value::Null] {
+        assert_eq!(lens(None, no.clone()), Lens::Pinhole);
+        assert_eq!(lens(Some("OPENCV"), no.clone()), Lens::Pinhole);
+        assert_eq!(lens(Some("OPENCV_FISHEYE"), no), fisheye);
+    }
+    let message = refused(|json| {
+        json["camera_model"] = "PINHOLE".into();
+        json["frames"][4]["is_fisheye"] = true.into();
+    });
+    assert!(message.contains("frames[4]"), "{message}");
+    let message = refused(|json| json["is_fisheye"] = "yes".into());
+    assert!(
+        message.contains("its is_fisheye is the text `yes`"),
+        "{message}"
+    );
+}
+
+#[test]
+fn coefficients_without_a_term_are_refused() {
+    for model in ["OPENCV", "OPENCV_FISHEYE"] {
+        let with = |key: &str, value: f64| {
+            let mut json = good();
+            json["camera_model"] = model.into();
+            json[key] = value.into();
+            json
+        };
+        for key in ["k5", "k6"] {
+            load(folder(&with(key, 0.0)).path()).unwrap();
+            let message = refused(|json| *json = with(key, 0.01));
+            let says = |word: &str| assert!(message.contains(word), "{message}");
+            says("the top level");
+            says(&format!("its {key} is 0.01"));
+            says("undistort");
+        }
+    }
+    let message = refused(|json| {
+        json["frames"][1]["k6"] = 0.5.into();
+        json["frames"][1]["distortion_params"] = json!([0.1]);
+    });
+    assert!(message.contains("frames[1]"), "{message}");
+}
+
+/// A frame that is zoomed in another way than the others.
+#[test]
+fn an_angle_of_a_frame_comes_before_focal_lengths_of_the_file() {
+    let capture = loaded(|json| {
+        json["camera_angle_x"] = 0.7.into();
+        json["frames"][2]["camera_angle_x"] = 0.2.into();
+        json["frames"][3]["camera_angle_y"] = 0.3.into();
+        json["frames"][4]["camera_angle_x"] = 0.2.into();
+        json["frames"][4]["fl_x"] = 50.0.into();
+    });
+    let f = |side: f64, angle: f64| 0.5 * side / (0.5 * angle).tan();
+    let focal = |index: usize| &capture.views[index].intrinsics[..2];
+    assert_eq!(focal(1), [30.0, 31.0]);
+    assert_eq!(focal(2), [f(24.0, 0.2); 2]);
+    assert_eq!(focal(3), [f(18.0, 0.3); 2]);
+    assert_eq!(focal(4), [50.0, 50.0]);
+    assert_eq!(capture.views[2].intrinsics[2..], [12.5, 8.5]);
+}
+
 /// As Brush and instant-ngp accept: from the field of view and the photo's size.
 #[test]
 fn an_angle_is_enough() {
@@ -380,6 +507,44 @@ fn rounded_and_scaled_rotations_are_made_exact() {
 }
 
 #[test]
+fn the_last_row_of_a_pose_is_checked() {
+    let message = refused(|json| json["frames"][2]["transform_matrix"][3][3] = 2.0.into());
+    for word in [
+        "frames[2] (`images/2.png`)",
+        "last row of its transform_matrix is [0.0, 0.0, 0.0, 2.0]",
+        "without a scale",
+    ] {
+        assert!(message.contains(word), "{message}");
+    }
+    let message = refused(|json| json["frames"][2]["transform_matrix"][3][1] = 0.5.into());
+    assert!(message.contains("[0.0, 0.5, 0.0, 1.0]"), "{message}");
+    assert!(!message.contains("transposed"), "{message}");
+    let message = refused(|json| {
+        for frame in json["frames"].as_array_mut().unwrap() {
+            let rows = frame["transform_matrix"].take();
+            let column = |at: usize| {
+                (0..4)
+                    .map(|row: usize| rows[row][at].clone())
+                    .collect::<Vec<_>>()
+            };
+            frame["transform_matrix"] = (0..4).map(column).collect::<Vec<_>>().into();
+        }
+    });
+    for word in ["frames[0]", "[0.0, 0.0, 4.0, 1.0]", "looks transposed"] {
+        assert!(message.contains(word), "{message}");
+    }
+    // Numbers in single precision; and rows of which the last is left out.
+    let same = loaded(|json| {
+        json["frames"][2]["transform_matrix"][3] = json!([1e-7, -0.0, 0.0, 1.0000001]);
+        let rows = json["frames"][3]["transform_matrix"].as_array_mut();
+        rows.unwrap().truncate(3);
+    });
+    for (view, other) in same.views.iter().zip(loaded(|_| {}).views) {
+        assert_eq!(view.viewmat, other.viewmat);
+    }
+}
+
+#[test]
 fn photos_may_be_anywhere_and_names_stay_inside() {
     let outer = TempDir::new().unwrap();
     let root = outer.path().join("processed/run");
@@ -477,6 +642,15 @@ fn lists_of_names_are_the_split() {
         (capture.split.train, capture.split.test),
         (vec![0, 1, 2], vec![3, 4, 5])
     );
+    let message = refused(|json| {
+        json["train_filenames"] = json!(["images/0.png", "images/1.png"]);
+        json["test_filenames"] = json!(["./images/1.png"]);
+    });
+    for word in ["`1.png`", "`train_filenames`", "`test_filenames`"] {
+        assert!(message.contains(word), "{message}");
+    }
+    let message = refused(|json| json["test_filenames"] = json!(["images/1.png", "images/1.png"]));
+    assert!(message.contains("`1.png` twice"), "{message}");
     let mut json = good();
     json["train_filenames"] = json!(["images/0.png", "images/8.png"]);
     json["test_filenames"] = json!(["images/5.png"]);
@@ -520,7 +694,14 @@ fn points_are_read_from_ply() {
     json["ply_file_path"] = "more/points.ply".into();
     write(root.path(), "transforms.json", &json);
     let message = load(root.path()).unwrap_err().to_string();
-    assert!(message.contains("points.ply"), "{message}");
+    for word in [
+        "transforms.json: the top level",
+        "ply_file_path",
+        "points.ply",
+        "remove the field",
+    ] {
+        assert!(message.contains(word), "{message}");
+    }
     fs::create_dir(root.path().join("more")).unwrap();
     let path = root.path().join("more/points.ply");
     fs::write(&path, PLY.replace("1 2 3 4", "8 2 3 4")).unwrap();
