@@ -26,7 +26,8 @@ const SCALING_SVG: &str = "performance_scaling.svg";
   splat bench performance --report docs
   splat bench performance photos/ --downscale 2 --report docs")]
 pub(super) struct PerformanceArgs {
-    /// Capture: a folder with `images/` and `sparse/0/`, or with `transforms.json` [default: examples/data/saharov]
+    /// Capture: a folder with `images/` and `sparse/0/`, or with `transforms.json` [default:
+    /// examples/data/saharov]
     capture: Option<PathBuf>,
     #[command(flatten)]
     input: CaptureArgs,

@@ -22,7 +22,8 @@ use splat_lab::performance::{device_step, step};
 
 Measures the CPU unless --device names another.")]
 pub(super) struct StepArgs {
-    /// Capture: a folder with `images/` and `sparse/0/`, or with `transforms.json` [default: examples/data/saharov]
+    /// Capture: a folder with `images/` and `sparse/0/`, or with `transforms.json` [default:
+    /// examples/data/saharov]
     capture: Option<PathBuf>,
     #[command(flatten)]
     input: CaptureArgs,

@@ -98,7 +98,8 @@ impl Intrinsics {
         }
     }
 
-    /// Size of the photos and `[fx, fy, cx, cy]` in their pixels, if these do not depend on the photo.
+    /// Size of the photos and `[fx, fy, cx, cy]` in their pixels, if these do not depend on the
+    /// photo.
     pub fn pixels(&self) -> Option<([u32; 2], [f64; 4])> {
         match *self {
             Self::Pixels { size, values } => Some((size, values)),
