@@ -28,7 +28,7 @@
 //!
 //! | op | computes |
 //! |---|---|
-//! | [`ops::project()`] | screen splats of 3D Gaussians, with gradients of poses and intrinsics |
+//! | [`ops::project()`] | screen splats of 3D Gaussians, with gradients of poses, intrinsics and distortion |
 //! | [`ops::sh_colors()`] | clamped view-dependent colours from spherical harmonics |
 //! | [`ops::spherical_harmonics()`] | the plain sum of spherical harmonics |
 //! | [`ops::rasterize()`] | an image of any number of channels, and alpha |

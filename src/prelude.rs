@@ -5,7 +5,9 @@ pub use burn;
 pub use burn::module::{Module, Param};
 pub use burn::tensor::{Device, Gradients, Int, Tensor, TensorData};
 
-pub use splat_data::{Camera, Capture, CaptureSettings, ImageSize, SceneScale, SplatData, View};
+pub use splat_data::{
+    Camera, Capture, CaptureSettings, ImageSize, Lens, SceneScale, SplatData, View,
+};
 pub use splat_model::optimizer::{SplatAdam, StateRecord};
 pub use splat_model::strategy::{
     Adc, AdcSettings, ImprovedGs, ImprovedGsSettings, Mcmc, McmcSettings, Refinement, ScreenWants,
@@ -17,9 +19,10 @@ pub use splat_model::{
     reduce_sh_degrees, render, splats_from_points,
 };
 pub use splat_ops::{
-    AdamRows, OpError, ProjectSettings, Projected, RasterizeSettings, Rendered, ShRest, ShStarts,
-    project, rasterize, sh_colors,
+    AdamRows, CameraModel, Distortion, Intrinsics, OpError, ProjectSettings, Projected,
+    RasterizeSettings, Rendered, ShRest, ShStarts, project, rasterize, sh_colors,
 };
+pub use splat_trainer::calibration::CalibrationSettings;
 pub use splat_trainer::{
     Hook, HookView, LossTerms, StrategyKind, TargetView, TrainSettings, Trained, Trainer, evaluate,
 };
