@@ -76,7 +76,7 @@ pub(super) fn load(
 }
 
 /// True if both paths lead to the same file or folder.
-fn is_same(a: &Path, b: &Path) -> bool {
+pub(super) fn is_same(a: &Path, b: &Path) -> bool {
     matches!((a.canonicalize(), b.canonicalize()), (Ok(a), Ok(b)) if a == b)
 }
 

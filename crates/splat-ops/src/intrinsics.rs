@@ -46,8 +46,8 @@ pub struct Distortion {
     pub model: CameraModel,
     /// Coefficients `[C, K]`, in the order of [`CameraModel::coefficient_names`].
     pub coefficients: Tensor<2>,
-    /// Domains `[C, 2]` as [`Lens::domain`] has them: largest radius or angle, and radius of the
-    /// clamp. A constant: it carries no gradient.
+    /// Domains `[C, 2]` as [`Lens::photo_domain`] has them: largest radius or angle, and radius of
+    /// the clamp. A constant: it carries no gradient.
     pub domain: Tensor<2>,
 }
 

@@ -3,6 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use super::super::Failure;
+use super::super::photos::is_same;
 use super::results::{CHECKPOINT, METRICS, SCENE};
 use splat_trainer::Checkpoint;
 
@@ -81,12 +82,8 @@ fn not_resumable(given: &Path, checkpoint: &Path) -> Option<String> {
 /// it is all that is left of that run.
 pub(super) fn refuse_unfinished(out: &Path, resumed: Option<&Path>) -> Result<(), Failure> {
     let path = out.join(CHECKPOINT);
-    let same = |other: &Path| match (other.canonicalize(), path.canonicalize()) {
-        (Ok(other), Ok(path)) => other == path,
-        _ => false,
-    };
     // A folder of that name is no checkpoint, and is reported as such.
-    if !path.is_file() || resumed.is_some_and(same) {
+    if !path.is_file() || resumed.is_some_and(|other| is_same(other, &path)) {
         return Ok(());
     }
     Err(Failure::BadInput(format!(

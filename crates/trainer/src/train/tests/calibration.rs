@@ -188,14 +188,18 @@ fn poses_are_fast_unless_all_were_adjusted() {
     );
 }
 
+/// One step of a run that refines poses.
+fn refining_poses() -> TrainSettings {
+    TrainSettings::new()
+        .with_steps(1)
+        .with_calibration(CalibrationSettings::new().with_poses(true))
+}
+
 #[test]
 fn too_few_keypoints_are_said() {
     let mut turned = turned_with_keypoints();
     turned.observations.truncate(20);
-    let calibration = CalibrationSettings::new().with_poses(true);
-    let settings = TrainSettings::new()
-        .with_steps(1)
-        .with_calibration(calibration);
+    let settings = refining_poses();
     let warnings = Arc::new(Mutex::new(Vec::new()));
     let said = warnings.clone();
     let trainer = builder_on(Arc::new(turned))
@@ -210,10 +214,7 @@ fn too_few_keypoints_are_said() {
 /// Poses that were adjusted in part would be those of another run.
 #[test]
 fn an_adjustment_that_is_interrupted_is_no_run() {
-    let calibration = CalibrationSettings::new().with_poses(true);
-    let settings = TrainSettings::new()
-        .with_steps(1)
-        .with_calibration(calibration);
+    let settings = refining_poses();
     let mut without = turned_with_keypoints();
     without.observations.clear();
     for capture in [turned_with_keypoints(), without] {
@@ -228,10 +229,7 @@ fn an_adjustment_that_is_interrupted_is_no_run() {
 /// By steps of the solver, and by photos where corners are looked for.
 #[test]
 fn the_adjustment_says_how_far_it_is() {
-    let calibration = CalibrationSettings::new().with_poses(true);
-    let settings = TrainSettings::new()
-        .with_steps(1)
-        .with_calibration(calibration);
+    let settings = refining_poses();
     let mut without = turned_with_keypoints();
     without.observations.clear();
     for (capture, fewest) in [(turned_with_keypoints(), 3), (without, 12)] {
@@ -255,10 +253,7 @@ fn keypoints_of_other_photos_are_left_aside() {
     for i in 0..count {
         other.observations[i].position = other.observations[(i + 997) % count].position;
     }
-    let calibration = CalibrationSettings::new().with_poses(true);
-    let settings = TrainSettings::new()
-        .with_steps(1)
-        .with_calibration(calibration);
+    let settings = refining_poses();
     let warnings = Arc::new(Mutex::new(Vec::new()));
     let said = warnings.clone();
     let trainer = builder_on(Arc::new(other))
