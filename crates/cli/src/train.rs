@@ -287,7 +287,7 @@ pub(super) fn run(args: &TrainArgs, global: &GlobalArgs) -> Result<(), Failure> 
             adjusted.views,
             adjusted.viewmats.len(),
             adjusted.keypoints,
-            if adjusted.matched {
+            if adjusted.error_rematched.is_some() {
                 " found in the photos"
             } else {
                 ""

@@ -360,12 +360,10 @@ fn adjusted(
         return Ok(None);
     };
     if !adjusted.fits {
-        let [before, after] = [adjusted.error_before, adjusted.error_after];
-        let matched = adjusted.matched;
         (watch.on_warning)(&Warning::KeypointsDoNotFit {
-            matched,
-            before,
-            after,
+            before: adjusted.error_before,
+            after: adjusted.error_after,
+            rematched: adjusted.error_rematched,
         });
         return Ok(None);
     }

@@ -96,12 +96,12 @@ pub enum Warning {
     TooFewKeypoints,
     /// The keypoints disagree with the photos and cameras.
     KeypointsDoNotFit {
-        /// True if they were looked for in the photos, false if they are the capture's.
-        matched: bool,
         /// Their median distance from the projected points, pixels.
         before: f64,
         /// The least that poses and points can reach.
         after: f64,
+        /// If they are corners that were matched: their distance when they were matched anew.
+        rematched: Option<f64>,
     },
     /// The state of the run could not be saved.
     NotSaved {
@@ -264,12 +264,12 @@ impl fmt::Display for Warning {
                 "the photos have too few keypoints in common to adjust poses to; poses are refined by gradients of the photos alone"
             ),
             Self::KeypointsDoNotFit {
-                matched: true,
                 after,
+                rematched: Some(rematched),
                 ..
             } => write!(
                 f,
-                "corners that the photos seem to share do not agree ({after:.2} pixels off in the median, and more when they are matched anew); poses are refined by gradients of the photos alone"
+                "corners that the photos seem to share do not agree: they are {after:.2} pixels off in the median at best, and {rematched:.2} when they are matched anew; poses are refined by gradients of the photos alone"
             ),
             Self::KeypointsDoNotFit { before, after, .. } => write!(
                 f,

@@ -53,18 +53,20 @@ pub struct BundleAdjustment {
     /// fewer than twelve keypoints are unchanged.
     pub viewmats: Vec<DMat4>,
     /// Positions of the capture's points. Those that fewer than two training views observe are
-    /// unchanged, and so are all if the keypoints were [`matched`](Self::matched).
+    /// unchanged, and so are all if corners were matched.
     pub points: Vec<[f64; 3]>,
     /// Number of training views whose poses were adjusted.
     pub views: usize,
     /// Keypoints that were used.
     pub keypoints: usize,
-    /// True if the capture has no keypoints of its own, and corners of its photos were taken.
-    pub matched: bool,
     /// Median distance of keypoints and projected points before, in pixels.
     pub error_before: f64,
     /// The same after.
     pub error_after: f64,
+    /// Of a capture without keypoints, whose photos' corners were matched: median distance of the
+    /// last matches from where the poses have them that were adjusted to those before. `None` for
+    /// keypoints of the capture.
+    pub error_rematched: Option<f64>,
     /// True if the keypoints agree: the error after is no larger than before, and at most 0.3 % of
     /// the photo's longer side, that before at most 5 %. Matched ones must also be found anew where
     /// the adjusted poses have them, within the same bound. If false, they are those of other
@@ -173,7 +175,7 @@ fn of_corners(
             fits: next.fits && before <= LARGEST_ERROR * longer(views),
             error_before: adjusted.map_or(before, |first| first.error_before),
             points: start.points.iter().map(DVec3::to_array).collect(),
-            matched: true,
+            error_rematched: Some(before),
             ..next
         });
         viewmats = unknowns.viewmats;
@@ -194,9 +196,9 @@ fn result(
         points: vec![],
         views: problem.observing_views(),
         keypoints: problem.sights.len(),
-        matched: false,
         error_before,
         error_after,
+        error_rematched: None,
         // Not so with NaN.
         fits: error_after <= error_before.max(NO_ERROR * longer(views))
             && error_before <= LARGEST_ERROR_BEFORE * longer(views)

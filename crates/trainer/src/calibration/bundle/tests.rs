@@ -290,7 +290,10 @@ fn photos_without_keypoints_get_some() {
         ..
     } = adjusted;
     assert!(
-        adjusted.fits && adjusted.matched,
+        adjusted.fits
+            && adjusted
+                .error_rematched
+                .is_some_and(|error| error < adjusted.error_before),
         "{keypoints} {error_after}"
     );
     let (before, after) = (

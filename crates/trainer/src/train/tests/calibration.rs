@@ -264,7 +264,7 @@ fn keypoints_of_other_photos_are_left_aside() {
     assert!(trainer.bundle_adjustment().is_none());
     let warnings = warnings.lock().unwrap();
     assert!(
-        matches!(&warnings[..], [Warning::KeypointsDoNotFit { matched: false, before, after }] if after <= before),
+        matches!(&warnings[..], [Warning::KeypointsDoNotFit { before, after, rematched: None }] if after <= before),
         "{warnings:?}"
     );
     assert!(
