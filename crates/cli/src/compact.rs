@@ -65,12 +65,9 @@ pub(super) fn run(args: &CompactArgs, global: &GlobalArgs) -> Result<(), Failure
         )));
     }
     let device = device::open(global)?.device;
-    let mut splats = scene::read(&args.scene, global)?;
+    let splats = scene::read(&args.scene, Some(&capture), global)?;
     args.photos
         .warn_of_refined(&args.capture, &args.scene, global);
-    if splats.settings.background.is_none() {
-        splats.settings.background = capture.background;
-    }
     probe_file(&args.out)?;
     refuse_inputs([args.out.clone()], [args.scene.as_path()])?;
     for loss in encoder.losses(&splats) {
@@ -166,12 +163,13 @@ fn fewer_bits(
     encoded
 }
 
-/// A scene from a file, with what a viewer is told beside it. The size of the scene is not among
-/// that: where the file cannot hold it, planes follow from its Gaussians, here as for every reader.
+/// A scene from a file, with what is known beside it where the file cannot hold it, as
+/// `splat eval` knows it from the capture.
 fn as_original(mut read: SplatData, original: &SplatData) -> SplatData {
     let (settings, before) = (&mut read.settings, &original.settings);
     settings.background = settings.background.or(before.background);
     settings.antialias = settings.antialias.or(before.antialias);
+    settings.scene_scale = settings.scene_scale.or(before.scene_scale);
     read
 }
 

@@ -64,7 +64,13 @@ pub(super) fn run(args: &EvalArgs, global: &GlobalArgs) -> Result<(), Failure> {
         )));
     }
     let device = device::open(global)?.device;
-    let (gaussians, settings) = scene::open(&args.scene, &device, args.sh_precision, global)?;
+    let (gaussians, settings) = scene::open(
+        &args.scene,
+        Some(&capture),
+        &device,
+        args.sh_precision,
+        global,
+    )?;
     args.photos
         .warn_of_refined(&args.capture, &args.scene, global);
     probe_files([&args.json])?;

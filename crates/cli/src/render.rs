@@ -84,25 +84,31 @@ impl Channel {
 /// Runs the command.
 pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let device = device::open(global)?.device;
-    let (gaussians, settings) = scene::open(&args.scene, &device, args.sh_precision, global)?;
-    if args.cameras.capture.is_none() {
-        args.photos.refuse("of use with --capture only")?;
-    }
-    let mut inputs = vec![args.scene.clone()];
-    let cameras = match &args.cameras {
-        CameraArgs {
-            capture: Some(path),
-            ..
-        } => {
+    let capture = match &args.cameras.capture {
+        Some(path) => {
             args.photos.warn_of_refined(path, &args.scene, global);
-            let capture = args.photos.open(path, global)?;
-            inputs.extend(capture.photo_files());
-            cameras::of_capture(&capture)
+            Some(args.photos.open(path, global)?)
         }
-        CameraArgs {
-            camera: Some(path), ..
-        } => cameras::of_file(path)?,
-        CameraArgs { orbit, .. } => cameras::orbit(&gaussians.to_data(), orbit.unwrap_or(1)),
+        None => {
+            args.photos.refuse("of use with --capture only")?;
+            None
+        }
+    };
+    let (gaussians, settings) = scene::open(
+        &args.scene,
+        capture.as_ref(),
+        &device,
+        args.sh_precision,
+        global,
+    )?;
+    let mut inputs = vec![args.scene.clone()];
+    let cameras = match (&capture, &args.cameras.camera) {
+        (Some(capture), _) => {
+            inputs.extend(capture.photo_files());
+            cameras::of_capture(capture)
+        }
+        (None, Some(path)) => cameras::of_file(path)?,
+        (None, None) => cameras::orbit(&gaussians.to_data(), args.cameras.orbit.unwrap_or(1)),
     };
     probe_folder(&args.out)?;
     let mut progress = Progress::new(cameras.len() as u64, 0, global.quiet);

@@ -4,7 +4,7 @@ use std::path::Path;
 
 use burn::tensor::Device;
 use clap::ValueEnum;
-use splat_data::{SceneSettings, SplatData};
+use splat_data::{Capture, SceneSettings, SplatData};
 use splat_model::{Gaussians, RenderSettings, ShPrecision};
 
 use super::{Failure, GlobalArgs, text};
@@ -22,14 +22,16 @@ pub enum PrecisionChoice {
 
 /// Reads a scene and its render settings from its file. Files of earlier versions and of other
 /// programs do not say whether the scene was trained with anti-aliasing or a background; only for
-/// those, the run's `config.toml` beside the file is read, if there is one.
+/// those, the run's `config.toml` beside the file is read, if there is one. What neither says is
+/// taken from the capture that the scene is of, if there is one.
 pub(super) fn open(
     path: &Path,
+    capture: Option<&Capture>,
     device: &Device,
     precision: PrecisionChoice,
     global: &GlobalArgs,
 ) -> Result<(Gaussians, RenderSettings), Failure> {
-    let data = read(path, global)?;
+    let data = read(path, capture, global)?;
     let mut gaussians = Gaussians::from_data(&data, device);
     if precision == PrecisionChoice::Half {
         gaussians = gaussians.with_sh_precision(ShPrecision::Half);
@@ -41,7 +43,11 @@ pub(super) fn open(
 }
 
 /// Reads a scene with its render settings, with the warnings that they need.
-pub(super) fn read(path: &Path, global: &GlobalArgs) -> Result<SplatData, Failure> {
+pub(super) fn read(
+    path: &Path,
+    capture: Option<&Capture>,
+    global: &GlobalArgs,
+) -> Result<SplatData, Failure> {
     let mut data = splat_data::scene::read(path)?;
     for what in &data.settings.not_understood {
         global.say(format_args!(
@@ -50,6 +56,9 @@ pub(super) fn read(path: &Path, global: &GlobalArgs) -> Result<SplatData, Failur
         ));
     }
     ask_config(path, &mut data.settings, global);
+    if let Some(capture) = capture {
+        data.settings.complete_from(capture);
+    }
     Ok(data)
 }
 

@@ -5,8 +5,8 @@ use std::path::Path;
 use std::sync::Arc;
 
 use burn::tensor::{Device, Tensor};
-use splat_data::{Capture, CaptureSettings, View};
-use splat_model::{CameraTensors, SceneScale, render};
+use splat_data::{Capture, CaptureSettings};
+use splat_model::{CameraTensors, render};
 use splat_trainer::{TrainSettings, Trainer, evaluate};
 
 /// From a micrometre to a thousand kilometres, including two that are not powers of ten.
@@ -134,11 +134,7 @@ fn training_is_the_same_in_any_unit() {
 #[test]
 fn one_camera_far_out_does_not_change_the_scale() {
     let mut capture = (*capture(1.0)).clone();
-    let scale = |capture: &Capture| {
-        let cameras: Vec<_> = capture.views.iter().map(View::camera).collect();
-        let points: Vec<_> = capture.points.iter().map(|point| point.position).collect();
-        SceneScale::of_capture(&cameras, &points).length()
-    };
+    let scale = |capture: &Capture| capture.scene_scale().length();
     let before = scale(&capture);
     capture.views[7].viewmat[2][3] += 3_000.0;
     assert!((scale(&capture) / before - 1.0).abs() < 0.03);

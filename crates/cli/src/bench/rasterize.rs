@@ -77,8 +77,8 @@ pub(super) fn report(
     let device = chosen(global)?;
     let (gaussians, settings, name) = match ply {
         Some(ply) => {
-            let (gaussians, settings) =
-                scene::open(ply, &device, scene::PrecisionChoice::Exact, global)?;
+            let exact = scene::PrecisionChoice::Exact;
+            let (gaussians, settings) = scene::open(ply, Some(&capture), &device, exact, global)?;
             let name = format!("{} in the views of {}", ply.display(), capture.name);
             (gaussians, settings, name)
         }

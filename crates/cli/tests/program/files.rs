@@ -68,6 +68,29 @@ fn a_scene_is_converted_and_made_smaller() {
     }
 }
 
+/// The near plane of training is that of the capture's size, which SPZ has no room for.
+#[test]
+fn a_scene_that_does_not_say_its_size_has_that_of_the_capture() {
+    let folder = TempDir::new().unwrap();
+    let capture = example(folder.path());
+    let out = folder.path().join("out");
+    succeed(&train(&capture, &out, &["--steps", "1"]));
+    let whole = fs::read(out.join("scene.ply")).unwrap();
+    let comment = b"comment burn-splat scene_scale ";
+    let begin = (whole.windows(comment.len())).position(|words| words == comment);
+    let begin = begin.unwrap();
+    let end = begin + whole[begin..].iter().position(|b| *b == b'\n').unwrap() + 1;
+    let scores = [&b""[..], b"comment burn-splat scene_scale 100\n"].map(|line| {
+        let file = folder.path().join("other.ply");
+        fs::write(&file, [&whole[..begin], line, &whole[end..]].concat()).unwrap();
+        psnr(&capture, &file)
+    });
+    let said = psnr(&capture, &out.join("scene.ply"));
+    assert_eq!(scores[0], said);
+    // It matters: nothing is farther away than this near plane.
+    assert!(scores[1] < said - 1.0, "{scores:?} {said}");
+}
+
 #[test]
 fn files_that_cannot_be_written_are_refused_before_the_work() {
     let folder = TempDir::new().unwrap();

@@ -52,7 +52,7 @@ use std::sync::Arc;
 use glam::{DMat4, DVec4};
 use splat_core::{ImageSize, Lens};
 
-use crate::Camera;
+use crate::{Camera, SceneScale};
 use random_points::Room;
 
 pub use error::CaptureError;
@@ -287,6 +287,13 @@ impl Capture {
     pub fn photo_files(&self) -> Vec<PathBuf> {
         let file = |view: &View| self.photos.join(&view.name);
         self.views.iter().map(file).collect()
+    }
+
+    /// Size of the scene, of all cameras and points ([`SceneScale::of_capture`]).
+    pub fn scene_scale(&self) -> SceneScale {
+        let cameras: Vec<Camera> = self.views.iter().map(View::camera).collect();
+        let points: Vec<[f64; 3]> = self.points.iter().map(|point| point.position).collect();
+        SceneScale::of_capture(&cameras, &points)
     }
 
     /// Views for training, sorted by name.

@@ -39,7 +39,7 @@ pub use error::SceneFileError;
 pub use format::SceneFormat;
 pub use formats::{FORMATS, format_to_write, read, write};
 
-use crate::SceneScale;
+use crate::{Capture, SceneScale};
 
 /// A scene as stored in files: plain arrays, one entry per Gaussian, in the trained
 /// parametrisation.
@@ -80,6 +80,16 @@ pub struct SceneSettings {
     /// Render settings in the file that this program does not support, one line each; for a
     /// warning, and not written.
     pub not_understood: Vec<String>,
+}
+
+impl SceneSettings {
+    /// Takes from the capture that the scene is of what its file does not say: its size, without
+    /// which near and far plane follow from the spread of the Gaussians and are not those of
+    /// training, and the background.
+    pub fn complete_from(&mut self, capture: &Capture) {
+        (self.scene_scale).get_or_insert_with(|| capture.scene_scale().length());
+        self.background = self.background.or(capture.background);
+    }
 }
 
 impl SplatData {

@@ -405,9 +405,7 @@ fn calibration(
 
 /// Length, scene size and seed of the run.
 fn schedule(capture: &Capture, config: &TrainSettings) -> Result<RunSchedule, TrainError> {
-    let cameras: Vec<_> = capture.views.iter().map(View::camera).collect();
-    let points: Vec<[f64; 3]> = capture.points.iter().map(|point| point.position).collect();
-    let scene_scale = SceneScale::of_capture(&cameras, &points);
+    let scene_scale = capture.scene_scale();
     if !scene_scale.is_in_range() {
         return Err(TrainError::SceneSize {
             capture: capture.root.clone(),

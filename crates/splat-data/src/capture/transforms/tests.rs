@@ -9,6 +9,7 @@ use splat_core::Lens;
 
 use super::super::{Capture, Point};
 use super::*;
+use crate::SceneSettings;
 
 /// A capture of six photos of 24 x 18 pixels in `images/`, around the origin.
 fn good() -> Value {
@@ -792,6 +793,17 @@ fn blender_captures_are_on_white() {
         (&[0][..], &[1, 2][..])
     );
     assert_eq!(capture.background, Some([1.0; 3]));
+    // Which a scene of it need not say, nor its size.
+    let mut settings = SceneSettings::default();
+    settings.complete_from(&capture);
+    let size = capture.scene_scale().length();
+    assert_eq!(settings.scene_scale, Some(size));
+    assert_eq!(settings.background, Some([1.0; 3]));
+    settings.scene_scale = Some(2.0 * size);
+    settings.background = Some([0.5; 3]);
+    let said = settings.clone();
+    settings.complete_from(&capture);
+    assert_eq!(settings, said);
     let view = &capture.views[0];
     // 255 - (255 - 200) 128 / 255, and so on.
     assert_eq!(
