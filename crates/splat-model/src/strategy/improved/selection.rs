@@ -43,7 +43,8 @@ pub struct SelectionSettings {
     /// Factor of the opacities' learning rate during selection and for an eighth of its time after
     /// it. Default 4.
     pub opacity_rate: f64,
-    /// Below this opacity a Gaussian has not survived. Default 0.001.
+    /// Below this opacity a Gaussian has not survived. Default 1/255, below which it is never drawn
+    /// and no photo can raise it again (0.001 in GNS, whose survivors may be such).
     pub prune_opacity: f64,
 }
 
@@ -56,7 +57,7 @@ impl Default for SelectionSettings {
             stop: 23_000,
             weight: 2e-4,
             opacity_rate: 4.0,
-            prune_opacity: 0.001,
+            prune_opacity: 1.0 / 255.0,
         }
     }
 }
