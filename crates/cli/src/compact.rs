@@ -65,7 +65,7 @@ pub(super) fn run(args: &CompactArgs, global: &GlobalArgs) -> Result<(), Failure
         )));
     }
     let device = device::open(global)?.device;
-    let splats = scene::read(&args.scene, Some(&capture), global)?;
+    let mut splats = scene::read(&args.scene, global)?;
     args.photos
         .warn_of_refined(&args.capture, &args.scene, global);
     probe_file(&args.out)?;
@@ -73,6 +73,7 @@ pub(super) fn run(args: &CompactArgs, global: &GlobalArgs) -> Result<(), Failure
     for loss in encoder.losses(&splats) {
         global.say(format_args!("warning: {}: {loss}", args.out.display()));
     }
+    splats.settings.complete_from(&capture);
 
     let judge = Judge::new(&train, &device);
     let whole = judge.psnr(&splats)?;

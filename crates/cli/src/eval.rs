@@ -64,13 +64,9 @@ pub(super) fn run(args: &EvalArgs, global: &GlobalArgs) -> Result<(), Failure> {
         )));
     }
     let device = device::open(global)?.device;
-    let (gaussians, settings) = scene::open(
-        &args.scene,
-        Some(&capture),
-        &device,
-        args.sh_precision,
-        global,
-    )?;
+    let mut data = scene::read(&args.scene, global)?;
+    data.settings.complete_from(&capture);
+    let (gaussians, settings) = scene::on_device(&data, &device, args.sh_precision, global);
     args.photos
         .warn_of_refined(&args.capture, &args.scene, global);
     probe_files([&args.json])?;

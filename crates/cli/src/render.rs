@@ -84,23 +84,20 @@ impl Channel {
 /// Runs the command.
 pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure> {
     let device = device::open(global)?.device;
+    let mut data = scene::read(&args.scene, global)?;
     let capture = match &args.cameras.capture {
         Some(path) => {
             args.photos.warn_of_refined(path, &args.scene, global);
-            Some(args.photos.open(path, global)?)
+            let capture = args.photos.open(path, global)?;
+            data.settings.complete_from(&capture);
+            Some(capture)
         }
         None => {
             args.photos.refuse("of use with --capture only")?;
             None
         }
     };
-    let (gaussians, settings) = scene::open(
-        &args.scene,
-        capture.as_ref(),
-        &device,
-        args.sh_precision,
-        global,
-    )?;
+    let (gaussians, settings) = scene::on_device(&data, &device, args.sh_precision, global);
     let mut inputs = vec![args.scene.clone()];
     let cameras = match (&capture, &args.cameras.camera) {
         (Some(capture), _) => {
@@ -108,7 +105,7 @@ pub(super) fn run(args: &RenderArgs, global: &GlobalArgs) -> Result<(), Failure>
             cameras::of_capture(capture)
         }
         (None, Some(path)) => cameras::of_file(path)?,
-        (None, None) => cameras::orbit(&gaussians.to_data(), args.cameras.orbit.unwrap_or(1)),
+        (None, None) => cameras::orbit(&data, args.cameras.orbit.unwrap_or(1)),
     };
     probe_folder(&args.out)?;
     let mut progress = Progress::new(cameras.len() as u64, 0, global.quiet);

@@ -78,7 +78,9 @@ pub(super) fn report(
     let (gaussians, settings, name) = match ply {
         Some(ply) => {
             let exact = scene::PrecisionChoice::Exact;
-            let (gaussians, settings) = scene::open(ply, Some(&capture), &device, exact, global)?;
+            let mut data = scene::read(ply, global)?;
+            data.settings.complete_from(&capture);
+            let (gaussians, settings) = scene::on_device(&data, &device, exact, global);
             let name = format!("{} in the views of {}", ply.display(), capture.name);
             (gaussians, settings, name)
         }

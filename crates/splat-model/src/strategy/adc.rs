@@ -1,4 +1,5 @@
-//! Adaptive density control of 3DGS (section 5.2), with the defaults and options of gsplat.
+//! Adaptive density control of 3DGS (section 5.2), with the defaults of gsplat; docs/STRATEGIES.md
+//! has what differs.
 
 use burn::tensor::Device;
 use derive_setters::Setters;

@@ -242,9 +242,22 @@ impl<M: SplatModel> TrainerBuilder<M> {
         let mut config = self.config;
         // What transparent photos were composited on is behind the scene.
         config.background = config.background.or(self.capture.background);
-        if config.max_gaussians().is_none() {
+        let by_default = config.max_gaussians().is_none();
+        if by_default {
             let share = config.max_gaussians_share;
-            config.set_max_gaussians(default_max_gaussians(&self.capture, share));
+            let mut most = default_max_gaussians(&self.capture, share);
+            let selects = config.improved.selection.final_share.is_some();
+            if selects && config.strategy == StrategyKind::Improved {
+                // Small photos with many points: what is selected is a share of all of them.
+                most = most.max(self.capture.points.len());
+            }
+            config.set_max_gaussians(most);
+            (config.improved.validate()).map_err(|problem| {
+                TrainError::Config(format!(
+                    "{}; that is the default limit of growth for these photos: give `improved.max_gaussians` (--max-gaussians) or a larger `max_gaussians_share`",
+                    problem.replacen('`', "`improved.", 1)
+                ))
+            })?;
         }
         let strategy = self.strategy.take();
         let strategy = strategy.unwrap_or_else(|| match config.strategy {

@@ -13,6 +13,7 @@ mod loss_log;
 mod progress;
 mod recipe;
 mod resolution_schedule;
+mod room;
 mod run;
 mod settings;
 mod sh_reduction;

@@ -191,6 +191,25 @@ impl TrainSettings {
         }
     }
 
+    /// Names of the sections that are not as by default and belong to a strategy that is not
+    /// chosen, so that they have no effect.
+    pub fn unused_sections(&self) -> Vec<&'static str> {
+        let usual = Self::default();
+        let changed = [
+            (StrategyKind::Adc, "density", self.density != usual.density),
+            (StrategyKind::Mcmc, "mcmc", self.mcmc != usual.mcmc),
+            (
+                StrategyKind::Improved,
+                "improved",
+                self.improved != usual.improved,
+            ),
+        ];
+        (changed.into_iter())
+            .filter(|(strategy, _, changed)| *changed && *strategy != self.strategy)
+            .map(|(_, name, _)| name)
+            .collect()
+    }
+
     /// Limits the growth of the strategy.
     pub fn set_max_gaussians(&mut self, most: usize) {
         match self.strategy {
@@ -291,6 +310,22 @@ impl TrainSettings {
                 "`improved.selection.final_share` is a share of the limit of growth, and there is none: give `improved.max_gaussians` or a finite `max_gaussians_share`"
                     .to_owned(),
             );
+        }
+        let name = match self.strategy {
+            StrategyKind::Mcmc => Some("mcmc"),
+            StrategyKind::Improved if self.improved.selection.final_gaussians.is_none() => {
+                Some("improved")
+            }
+            _ => None,
+        };
+        if let (Some(name), None, true) = (
+            name,
+            self.max_gaussians(),
+            self.max_gaussians_share.is_infinite(),
+        ) {
+            return Err(format!(
+                "nothing ends the growth of the strategy {name}: give `{name}.max_gaussians` (--max-gaussians) or a finite `max_gaussians_share`"
+            ));
         }
         (self.mcmc.validate()).map_err(|problem| problem.replacen('`', "`mcmc.", 1))?;
         (self.improved.validate()).map_err(|problem| problem.replacen('`', "`improved.", 1))?;
@@ -563,6 +598,17 @@ mod tests {
             found.contains("`improved.selection.final_share`"),
             "{found}"
         );
+        for strategy in [StrategyKind::Mcmc, StrategyKind::Improved] {
+            let found = problem(&|config| {
+                config.strategy = strategy;
+                config.max_gaussians_share = f64::INFINITY;
+            });
+            assert!(found.contains("nothing ends the growth"), "{found}");
+            let mut ended = TrainSettings::new().with_strategy(strategy);
+            ended.max_gaussians_share = f64::INFINITY;
+            ended.set_max_gaussians(1_000);
+            assert_eq!(ended.validate(), Ok(()));
+        }
         let found = problem(&|config| {
             config.sh_reduction = Some(ShReductionSettings::new().with_at(1.0));
         });
@@ -582,5 +628,16 @@ mod tests {
             problem(&|config| config.density.split_scale = f64::INFINITY),
             ""
         );
+    }
+
+    #[test]
+    fn sections_of_other_strategies_are_named() {
+        let mut config = TrainSettings::new();
+        config.density.grow_gradient = Some(1e-3);
+        assert_eq!(config.unused_sections(), [""; 0]);
+        config.improved.selection.final_share = Some(0.3);
+        assert_eq!(config.unused_sections(), ["improved"]);
+        config.strategy = StrategyKind::Mcmc;
+        assert_eq!(config.unused_sections(), ["density", "improved"]);
     }
 }

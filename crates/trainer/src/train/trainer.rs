@@ -27,7 +27,7 @@ use super::training_views::CaptureViews;
 use super::watch::Watch;
 use super::{
     Checkpoint, LossTerms, TargetView, TrainError, TrainSettings, Warning, resolution_schedule,
-    sh_schedule, views, warnings,
+    room, sh_schedule, views, warnings,
 };
 use crate::calibration::BundleAdjustment;
 use crate::hooks::{HookView, Purpose};
@@ -125,6 +125,13 @@ impl<M: SplatModel> Trainer<M> {
     /// How poses and points were adjusted to the keypoints of the capture, if they were.
     pub fn bundle_adjustment(&self) -> Option<&BundleAdjustment> {
         self.adjusted.as_ref()
+    }
+
+    /// Says that the limit of growth of the settings, or what their selection keeps, is below the
+    /// Gaussians that there are, if it is. A strategy of the caller's own has limits of its own.
+    pub fn warning_of_room(&self) -> Option<Warning> {
+        let by_default = self.record.config.max_gaussians().is_none();
+        room::warning(&self.config, self.state.model.count(), by_default)
     }
 
     /// Size of the scene, from which every length of the run follows.

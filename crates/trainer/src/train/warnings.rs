@@ -89,6 +89,22 @@ pub enum Warning {
         /// Their names.
         views: Vec<String>,
     },
+    /// Growth is limited to fewer Gaussians than the run begins with.
+    NoRoomToGrow {
+        /// The limit.
+        limit: usize,
+        /// Gaussians that there are.
+        gaussians: usize,
+        /// True if the limit is the default for the photos.
+        by_default: bool,
+    },
+    /// Natural selection keeps fewer Gaussians than the run begins with.
+    SelectionOfFew {
+        /// How many it keeps.
+        survivors: usize,
+        /// Gaussians that there are.
+        gaussians: usize,
+    },
     /// [`TrainSettings::sh_reduction`](super::TrainSettings::sh_reduction) asks for a reduction
     /// that the run is too short for.
     ShReductionNeverDue,
@@ -255,6 +271,37 @@ impl fmt::Display for Warning {
                 "{}: the photo has other pixels than the one that the run was begun with; it goes on with those there are now",
                 Names(views)
             ),
+            Self::NoRoomToGrow {
+                limit,
+                gaussians,
+                by_default,
+            } => {
+                match by_default {
+                    true => write!(
+                        f,
+                        "the default limit of {limit} Gaussians for photos of this number and size"
+                    )?,
+                    false => write!(f, "--max-gaussians {limit}")?,
+                }
+                write!(
+                    f,
+                    " is below the {gaussians} that the run begins with: they are kept, and none is added unless pruning leaves fewer than {limit}"
+                )?;
+                match by_default {
+                    true => write!(
+                        f,
+                        "; --max-gaussians, a larger `max_gaussians_share` or larger photos make room"
+                    ),
+                    false => Ok(()),
+                }
+            }
+            Self::SelectionOfFew {
+                survivors,
+                gaussians,
+            } => write!(
+                f,
+                "the selection keeps {survivors} of the {gaussians} Gaussians that the run begins with; a larger `improved.selection.final_share` or `final_gaussians` keeps more"
+            ),
             Self::ShReductionNeverDue => write!(
                 f,
                 "`sh_reduction` lowers no degrees: the run ends before the highest degree is trained, or before the share `sh_reduction.at` of it; train for more steps, or leave it out"
@@ -269,7 +316,7 @@ impl fmt::Display for Warning {
                 ..
             } => write!(
                 f,
-                "corners that the photos seem to share do not agree: they are {after:.2} pixels off in the median at best, and {rematched:.2} when they are matched anew; poses are refined by gradients of the photos alone"
+                "corners that the photos seem to share do not agree: they are {after:.2} pixels off in the median at best, and {rematched:.2} when they are matched anew, where 0.3 % of the longer side is the most; poses are refined by gradients of the photos alone"
             ),
             Self::KeypointsDoNotFit { before, after, .. } => write!(
                 f,

@@ -113,9 +113,11 @@ impl SelectionSettings {
                 "`{name}` must lie in [{least}, {most}], it is {value}"
             ));
         }
-        if !(0.0..1.0).contains(&self.prune_opacity) {
+        if !(0.0..=0.1).contains(&self.prune_opacity) {
             let prune = self.prune_opacity;
-            return Err(format!("`prune_opacity` must lie in [0, 1), it is {prune}"));
+            return Err(format!(
+                "`prune_opacity` must lie in [0, 0.1], it is {prune}: what is opaque is not to be removed"
+            ));
         }
         Ok(())
     }

@@ -92,7 +92,7 @@ impl ImprovedGsSettings {
     }
 
     /// How many survive the selection, if there is one.
-    pub(super) fn survivors(&self) -> Option<usize> {
+    pub fn survivors(&self) -> Option<usize> {
         self.selection.survivors(self.max_gaussians)
     }
 

@@ -63,9 +63,9 @@ pub struct BundleAdjustment {
     pub error_before: f64,
     /// The same after.
     pub error_after: f64,
-    /// Of a capture without keypoints, whose photos' corners were matched: median distance of the
-    /// last matches from where the poses have them that were adjusted to those before. `None` for
-    /// keypoints of the capture.
+    /// For a capture without keypoints, whose photos' corners were matched: the median error of the
+    /// last matches, measured with the poses that were adjusted to the matches before them. `None`
+    /// for keypoints of the capture.
     pub error_rematched: Option<f64>,
     /// True if the keypoints agree: the error after is no larger than before, and at most 0.3 % of
     /// the photo's longer side, that before at most 5 %. Matched ones must also be found anew where
