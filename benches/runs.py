@@ -90,7 +90,8 @@ def picture(name, arms, captures):
     `arms` has name and colour of each arm, `captures` the figures of the runs of each arm.
     """
     side, gap = 300, 70
-    width = gap + len(captures) * (side + gap)
+    # At least as wide as the names of the arms below.
+    width = max(gap + len(captures) * (side + gap), gap + 200 * len(arms))
     parts = [f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {side + 130}" font-family="sans-serif" font-size="12">']
     parts.append(f'<rect width="{width}" height="{side + 130}" fill="white"/>')
     for index, (capture, runs_of) in enumerate(captures.items()):

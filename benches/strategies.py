@@ -22,8 +22,8 @@ ARMS = {
     "adc": ("ADC", 'strategy = "adc"\n', None),
     "absgrad6": ("AbsGrad, 6e-4", 'strategy = "adc"\n[density]\nabsgrad = true\ngrow_gradient = 6e-4\n', None),
     "absgrad8": ("AbsGrad, 8e-4", 'strategy = "adc"\n[density]\nabsgrad = true\ngrow_gradient = 8e-4\n', None),
-    "mcmc": ("MCMC, as many as ADC", 'strategy = "mcmc"\n', 1),
-    "mcmc3": ("MCMC, a third", 'strategy = "mcmc"\n', 3),
+    "mcmc": ("MCMC, up to ADC's count", 'strategy = "mcmc"\n', 1),
+    "mcmc3": ("MCMC, up to a third", 'strategy = "mcmc"\n', 3),
 }
 COLORS = {"adc": "#1f77b4", "absgrad6": "#ff7f0e", "absgrad8": "#d62728", "mcmc": "#2ca02c", "mcmc3": "#17becf"}
 # Strategies are compared with the rates that their constants are for.
@@ -71,7 +71,8 @@ def rows(found):
                 continue
             cells = [name, str(len(arms[arm]))]
             for key, digits in (("psnr", 2), ("ssim", 4), ("gaussians", 0), ("time", 2)):
-                cells.append(runs.cell([figures[key] for figures in arms[arm]], digits))
+                values = [figures[key] for figures in arms[arm]]
+                cells.append("1" if (arm, key) == ("adc", "time") else runs.cell(values, digits))
             yield "| " + " | ".join(cells) + " |"
 
 
