@@ -12,7 +12,6 @@ compared by `splat bench recipes`, which takes turns.
 """
 
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -130,10 +129,4 @@ def report():
 
 
 if __name__ == "__main__":
-    what, *paths = sys.argv[1:] or [""]
-    if what == "run" and len(paths) > 1:
-        run(Path(paths[0]), [Path(path) for path in paths[1:]])
-    elif what == "report" and not paths:
-        report()
-    else:
-        sys.exit(__doc__)
+    runs.main(run, report, __doc__)

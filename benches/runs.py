@@ -5,6 +5,7 @@ import json
 import math
 import resource
 import subprocess
+import sys
 import tempfile
 from pathlib import Path
 
@@ -128,3 +129,14 @@ def axis(values, least=None):
     first, last = math.floor(low / step - 0.2), math.ceil(high / step + 0.2)
     first = max(first, 0) if least == 0 else first
     return first * step, last * step, [round(tick * step, 6) for tick in range(first, last + 1)]
+
+
+def main(run, report, usage):
+    """The command line of a comparison: `run SPLAT CAPTURE...` or `report`."""
+    what, *paths = sys.argv[1:] or [""]
+    if what == "run" and len(paths) > 1:
+        run(Path(paths[0]), [Path(path) for path in paths[1:]])
+    elif what == "report" and not paths:
+        report()
+    else:
+        sys.exit(usage)

@@ -9,7 +9,6 @@ comparison goes on, and processes for different captures may run at once (RAYON_
 Runs are half size, 7,000 steps, on the CPU, with the seeds 0, 1 and 2.
 """
 
-import sys
 import tempfile
 from pathlib import Path
 
@@ -84,10 +83,4 @@ def report():
 
 
 if __name__ == "__main__":
-    what, *paths = sys.argv[1:] or [""]
-    if what == "run" and len(paths) > 1:
-        run(Path(paths[0]), [Path(path) for path in paths[1:]])
-    elif what == "report" and not paths:
-        report()
-    else:
-        sys.exit(__doc__)
+    runs.main(run, report, __doc__)

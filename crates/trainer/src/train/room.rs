@@ -2,10 +2,12 @@
 
 use super::{StrategyKind, TrainSettings, Warning};
 
-/// What a limit below the first Gaussians means, if it is below. `by_default` says that the limit
-/// is not the settings' own.
+/// What a limit below the Gaussians that there are means, or a selection below the points that the
+/// run began with: a resumed run may have grown to more. `by_default` says that the limit is not
+/// the settings' own.
 pub(super) fn warning(
     config: &TrainSettings,
+    points: usize,
     gaussians: usize,
     by_default: bool,
 ) -> Option<Warning> {
@@ -13,10 +15,10 @@ pub(super) fn warning(
         StrategyKind::Improved => config.improved.survivors(),
         _ => None,
     };
-    if let Some(survivors) = survivors.filter(|survivors| *survivors < gaussians) {
+    if let Some(survivors) = survivors.filter(|survivors| *survivors < points) {
         return Some(Warning::SelectionOfFew {
             survivors,
-            gaussians,
+            gaussians: points,
         });
     }
     let limit = config.max_gaussians().filter(|limit| *limit < gaussians)?;
@@ -35,9 +37,11 @@ mod tests {
     fn a_limit_below_the_first_gaussians_is_named() {
         let mut config = TrainSettings::new();
         config.set_max_gaussians(1_000);
-        assert_eq!(warning(&config, 1_000, false), None);
+        assert_eq!(warning(&config, 1_000, 1_000, false), None);
         let text = |config: &TrainSettings, by_default| {
-            warning(config, 1_001, by_default).unwrap().to_string()
+            warning(config, 1_001, 1_001, by_default)
+                .unwrap()
+                .to_string()
         };
         let given = text(&config, false);
         assert!(
@@ -55,6 +59,7 @@ mod tests {
             "{selected}"
         );
         config.set_max_gaussians(4_000);
-        assert_eq!(warning(&config, 1_001, true), None);
+        // Nor where a resumed run has grown.
+        assert_eq!(warning(&config, 1_001, 4_000, true), None);
     }
 }

@@ -131,7 +131,8 @@ impl<M: SplatModel> Trainer<M> {
     /// Gaussians that there are, if it is. A strategy of the caller's own has limits of its own.
     pub fn warning_of_room(&self) -> Option<Warning> {
         let by_default = self.record.config.max_gaussians().is_none();
-        room::warning(&self.config, self.state.model.count(), by_default)
+        let points = self.capture.points.len();
+        room::warning(&self.config, points, self.state.model.count(), by_default)
     }
 
     /// Size of the scene, from which every length of the run follows.
